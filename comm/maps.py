@@ -31,7 +31,7 @@ _DIAGONAL = 2**0.5  # greatest distance over the ground that a unit of action le
 class MapsConfig:
     """Stores the settings under `comm`."""
 
-    home: bool = True
+    home: bool = False
     """whether UAVs fly to a chain of radios to the base in time, whatever the policy does; without
     a base, and without a radio that reaches it, they do not"""
 

@@ -79,6 +79,7 @@ BASE_SIDE = 30
 """Cells of the shorter side for which lengths of a fire are given."""
 SIDES = (8, 256)
 """minimum and maximum cells along a side of a grid"""
+_Share = Annotated[float, Field(ge=0, le=1)]
 _Side = Annotated[int, Field(ge=SIDES[0], le=SIDES[1])]
 
 
@@ -99,6 +100,9 @@ class WildfireConfig:
     """lowest and highest z, cells"""
     view_angle: Annotated[float, Field(gt=0, le=80)] = 30.0
     """half the opening angle of the camera, degrees"""
+    sensor: Annotated[tuple[_Share, _Share], Strict(False)] = (1.0, 1.0)
+    """probability that a UAV recognises a cell in view, at each look, at the lowest and the highest
+    altitude, linear between; what it does not recognise counts as not in view"""
     displacement: Annotated[float, Field(gt=0, le=256)] = 1.0
     """cells per unit of action"""
     observation: Literal["vector", "window", "map"] = "vector"

@@ -82,7 +82,7 @@ TRUE_MAP: Final = "true_map"
 
 STEPS: Final = "steps"
 """The steps of a held action, batch size [num_envs, hold]: what the measures of an episode need of
-each (`metrics.COUNTED`), under the same keys. Only after a step with `hold` above 1."""
+each (`metrics.counted`), under the same keys. Only after a step with `hold` above 1."""
 
 TEACHER: Final = (AGENTS, "teacher")
 """float32 [..., 3]: the action of a teacher with the UAV's own belief map; 0 at steps without a

@@ -26,10 +26,12 @@ NAMES = (
 """the measures of every episode, the paper's first"""
 MEASURED = ("front_age", "front_age_p95", "bytes_per_step")
 """the measures that `measures: all` adds"""
-OF_BASE = ("base_coverage", "base_age")
+OF_BASE = ("base_coverage", "base_coverage_auc", "base_age")
 """the measures that a base station adds"""
 ALL = (*NAMES, *MEASURED, *OF_BASE)
-HIGHER_IS_BETTER = frozenset({"mean_reward", "coverage", "coverage_auc", "base_coverage"})
+HIGHER_IS_BETTER = frozenset(
+    {"mean_reward", "coverage", "coverage_auc", "base_coverage", "base_coverage_auc"}
+)
 """the measures to maximise; the others are to be minimised"""
 
 
@@ -166,6 +168,15 @@ def base_coverage(seen: Tensor, burnt: Tensor) -> Tensor:
     return _ratio(seen, burnt)[..., -1]
 
 
+def base_coverage_auc(seen: Tensor, burnt: Tensor) -> Tensor:
+    """Returns the share of `base_coverage` averaged over all steps, in %.
+
+    Args:
+        seen, burnt: as for `base_coverage`.
+    """
+    return coverage_auc(seen, burnt)
+
+
 def base_age(ages: Tensor) -> Tensor:
     """Returns `front_age` of what the base knows.
 
@@ -205,6 +216,7 @@ def episode_metrics(steps: TensorDictBase) -> dict[str, Tensor]:
         measured["bytes_per_step"] = bytes_per_step(steps[keys.BYTES_SENT])
     if steps.get(keys.BASE_SEEN, None) is not None:
         measured["base_coverage"] = base_coverage(steps[keys.BASE_SEEN], burnt)
+        measured["base_coverage_auc"] = base_coverage_auc(steps[keys.BASE_SEEN], burnt)
         measured["base_age"] = base_age(steps[keys.BASE_AGE])
     return measured
 
@@ -215,7 +227,7 @@ def names(world: WildfireConfig) -> tuple[str, ...]:
     return (*NAMES, *measured, *(OF_BASE if world.base is not None else ()))
 
 
-COUNTED = (
+_COUNTED = (
     keys.REWARD,
     keys.SEEN,
     keys.BURNT,
@@ -223,9 +235,13 @@ COUNTED = (
     keys.OLD_FIRE,
     keys.HIT_BOUNDARY,
 )
-"""the keys of which `episode_metrics` reads every step, beside `keys.BYTES_SENT`"""
-_AT_THE_END = (keys.FRONT_AGE, keys.FRONT_AGE_P95, keys.BASE_SEEN, keys.BASE_AGE)
-"""the keys of which it reads the last step; only some worlds have them"""
+_AT_THE_END = (keys.FRONT_AGE, keys.FRONT_AGE_P95, keys.BASE_AGE)
+"""the keys of which `episode_metrics` reads the last step; only some worlds have them"""
+
+
+def counted(world: WildfireConfig) -> tuple[Any, ...]:
+    """Returns the keys of which it reads every step, beside `keys.BYTES_SENT`."""
+    return _COUNTED if world.base is None else (*_COUNTED, keys.BASE_SEEN)
 
 
 def measured_steps(steps: TensorDictBase) -> TensorDictBase:
@@ -234,7 +250,7 @@ def measured_steps(steps: TensorDictBase) -> TensorDictBase:
     Args:
         steps: the "next" of successive steps or decisions of a `WildfireEnv`, batch size [..., T].
     """
-    read = steps.select(*COUNTED, keys.BYTES_SENT, *_AT_THE_END, strict=False)
+    read = steps.select(*_COUNTED, keys.BASE_SEEN, keys.BYTES_SENT, *_AT_THE_END, strict=False)
     series = steps.get(keys.STEPS, None)
     if series is None:
         return read

@@ -40,8 +40,10 @@ class Moved(NamedTuple):
     seen: Tensor
     burning: Tensor
     burnt: Tensor
-    reward: Tensor | None
+    reward: Tensor | None = None
     """None at a reset"""
+    base_seen: Tensor | None = None
+    """None at a reset, and without a base"""
 
 
 class WildfireEnv(EnvBase):
@@ -195,7 +197,7 @@ class WildfireEnv(EnvBase):
         self.reward_spec = team(**reward)
         if self.hold > 1:
             step = Composite({keys.AGENTS: Composite({}, shape=agents)}, shape=envs)
-            for key in metrics.COUNTED:
+            for key in metrics.counted(world):
                 step[key] = (reward[key[1]] if key == keys.REWARD else observed[key]).clone()
             every = step.unsqueeze(1).expand((*envs, self.hold)).clone()
             # Not observed: they belong to the transition, and a reset has none.
@@ -302,7 +304,7 @@ class WildfireEnv(EnvBase):
         for ahead in self._ahead.split(self.hold if self._steer is None else 1):
             steered = chosen if self._steer is None else self._steer(chosen.copy())
             steps = self._snapshots(self._advance(steered.get(keys.ACTION), len(ahead)))
-            counted = steps.select(*metrics.COUNTED)
+            counted = steps.select(*metrics.counted(self.config))
             if self._communicate is None:
                 result = steps[-1]
             else:
@@ -327,18 +329,18 @@ class WildfireEnv(EnvBase):
             hits.append(move[1])
         position, hit_boundary = torch.stack(moves), torch.stack(hits)
         burning, burnt = self._map.count(time)
-        look = self._map.look(position.double(), time, burning, alive)
-        told = None
+        look = self._map.look(position.double(), self._step_key, time, burning, alive)
+        told = base_seen = None
         if self._measures is not None:
             at = position, self._step_key, time, alive, burnt
-            told = self._measures.update(look.view, look.ended, *at)
+            told, base_seen = self._measures.update(look.view, look.ended, *at)
         new, old, none = look.team.counts.unbind(-1)
         flies = self._all_alive if alive is None else alive
         penalised = self.config.reward.unseen != 0
         unseen = look.unseen.unsqueeze(-1) * flies if penalised else None
         reward = step_reward(new, old, none, hit_boundary, self.config.reward, told, unseen)
         self._time.copy_(time[-1])
-        counts = look.seen, burning, burnt, reward.unsqueeze(-1)
+        counts = look.seen, burning, burnt, reward.unsqueeze(-1), base_seen
         return Moved(time, alive, position, hit_boundary, look.shown, *counts)
 
     def _alive(self, time: Tensor) -> Tensor | None:
@@ -389,6 +391,7 @@ class WildfireEnv(EnvBase):
             keys.SEEN: now.seen,
             keys.BURNING: now.burning,
             keys.BURNT: now.burnt,
+            **({} if now.base_seen is None else {keys.BASE_SEEN: now.base_seen}),
             **done,
         }
         return TensorDict(root, time.shape, self.device)

@@ -283,7 +283,12 @@ class CoverageMap(nn.Module):
         return burnt - self._burnt_out.at(self._fire_index, step), burnt
 
     def look(
-        self, position: Tensor, step: Tensor, burning: Tensor, alive: Tensor | None = None
+        self,
+        position: Tensor,
+        rng_key: Tensor,
+        step: Tensor,
+        burning: Tensor,
+        alive: Tensor | None = None,
     ) -> Look:
         """Classifies the cells in view at successive steps and marks the burning ones as seen.
 
@@ -291,11 +296,12 @@ class CoverageMap(nn.Module):
 
         Args:
             position: float64 [steps, envs, uavs, 3], cells.
+            rng_key: int64 [envs], `keys.RNG_KEY`.
             step: int64 [steps, envs], steps since the episode began.
             burning: int64 [steps, envs], the number of burning cells, from `count`.
             alive: bool [steps, envs, uavs]; the others see nothing. All are alive if None.
         """
-        centre, cells, in_view = self._sensor.look(position, self._start)
+        centre, cells, in_view = self._sensor.look(position, self._start, rng_key, step)
         if alive is not None:
             in_view &= alive.unsqueeze(-1)
         time = step[..., None, None].float()

@@ -223,7 +223,7 @@ class Measures(nn.Module):
         step: Tensor,
         alive: Tensor | None,
         burnt: Tensor,
-    ) -> Tensor | None:
+    ) -> tuple[Tensor | None, Tensor | None]:
         """Adds successive steps.
 
         Args:
@@ -237,12 +237,13 @@ class Measures(nn.Module):
 
         Returns:
             The burnt cells new to the base at each step, for UAVs whose messages arrived there,
-            else 0, int64 [steps, envs, uavs]; None without a base.
+            else 0, int64 [steps, envs, uavs], and `base_seen` after each, int64 [steps, envs];
+            None without a base.
         """
         ignited = burnt.diff(dim=0, prepend=self.burnt.unsqueeze(0))
         self.burnt.copy_(burnt[-1])
         row, cell = ended
-        envs, told = burnt.shape[1], []
+        envs, told, known = burnt.shape[1], [], []
         for number, now in enumerate(step):
             looks = View(*(part[number] for part in view))
             ends = row // envs == number
@@ -255,7 +256,8 @@ class Measures(nn.Module):
                 flies = None if alive is None else alive[number]
                 hears = self.hears(position[number].double(), rng_key, now, flies)
                 told.append(self._report(looks, now, hears, ignited[number], gone))
-        return torch.stack(told) if told else None
+                known.append(self.base_seen.clone())
+        return (torch.stack(told), torch.stack(known)) if told else (None, None)
 
     def _report(
         self, view: View, step: Tensor, hears: Tensor, ignited: Tensor, ended: Cells

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from emberlink.envs.config import WildfireConfig
+from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.world import motion
 
 
@@ -21,19 +23,33 @@ class Sensor(nn.Module):
     of view at any altitude. Maps are stored flat and padded by half a window, so that windows lie
     within them. The cost of a step depends on the size of the window, not of the map.
 
+    A cell in view is recognised with a probability that falls with altitude, independently at each
+    look. That recognition gets worse with altitude is usual (Popovic et al. 2017, ICRA, let the
+    variance of a measurement grow with it). The straight line, its values, and that a UAV knows
+    which cells it has not recognised are assumptions of this project.
+
     Args:
         grid: cells along x and y.
         view_angle: half the opening angle, degrees.
-        ceiling: the maximum altitude, cells; it determines the size of the window.
+        altitude: the minimum and maximum, cells; the maximum determines the size of the window.
+        recognised: the probability at either.
     """
 
     _offsets: Tensor
     _window: Tensor
     _weights: Tensor
 
-    def __init__(self, grid: tuple[int, int], *, view_angle: float, ceiling: float):
+    def __init__(
+        self,
+        grid: tuple[int, int],
+        *,
+        view_angle: float,
+        altitude: tuple[float, float],
+        recognised: tuple[float, float] = (1.0, 1.0),
+    ):
         super().__init__()
-        reach = min(math.floor(view_radius(ceiling, view_angle) + 0.5), max(grid) - 1)
+        self._altitude, self._recognised = altitude, recognised
+        reach = min(math.floor(view_radius(altitude[1], view_angle) + 0.5), max(grid) - 1)
         self._inner = tuple(slice(reach, reach + side) for side in grid)
         self._padded = grid[0] + 2 * reach, grid[1] + 2 * reach
         self._slope = math.tan(math.radians(view_angle))
@@ -53,8 +69,9 @@ class Sensor(nn.Module):
     @classmethod
     def of(cls, world: WildfireConfig) -> "Sensor":
         """Returns the sensor of the UAVs of a world."""
-        ceiling = motion.corners(world.low, world.high)[1][2].item()
-        return cls(world.grid, view_angle=world.view_angle, ceiling=ceiling)
+        lowest, highest = (x[2].item() for x in motion.corners(world.low, world.high))
+        more = {"altitude": (lowest, highest), "recognised": world.sensor}
+        return cls(world.grid, view_angle=world.view_angle, **more)
 
     @property
     def area(self) -> int:
@@ -71,12 +88,25 @@ class Sensor(nn.Module):
         """Reverses `pad`: [..., area] -> [..., X, Y]."""
         return flat.unflatten(-1, self._padded)[..., self._inner[0], self._inner[1]]
 
-    def look(self, position: Tensor, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def recognition(self, altitude: Tensor) -> Tensor:
+        """Returns the probability that a cell in view is recognised, from altitudes, float64."""
+        (lowest, highest), (near, far) = self._altitude, self._recognised
+        return near + (far - near) * (altitude - lowest) / max(highest - lowest, 1e-6)
+
+    def look(
+        self,
+        position: Tensor,
+        start: Tensor,
+        rng_key: Tensor | None = None,
+        step: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Returns the window of each UAV and whether its cells are in view.
 
         Args:
             position: float64 [..., n, 3], within the grid, cells.
             start: int64, broadcast against [..., n]: index of the first cell of each UAV's map.
+            rng_key, step: int64 [...], `keys.RNG_KEY` and the step since the episode began, which
+                determine what is recognised; everything if None.
 
         Returns:
             centre: float64 [..., n, 2], the (i, j) of the cell nearest to the UAV.
@@ -89,6 +119,10 @@ class Sensor(nn.Module):
         near = distance <= (position[..., 2:] * self._slope).unsqueeze(-1)
         columns, rows = near.unbind(-2)
         in_view = (columns.unsqueeze(-1) & rows.unsqueeze(-2)).flatten(-2)
+        if self._recognised != (1.0, 1.0) and rng_key is not None and step is not None:
+            key = counter_rng.step_key(rng_key, step, Use.RECOGNITION)
+            unit = counter_rng.uniform(key, in_view.shape[-2:].numel())
+            in_view &= unit.view_as(in_view) < self.recognition(position[..., 2:])
         i, j = centre.unbind(-1)
         corner = torch.add(j, i, alpha=self._padded[1]).long() + start
         return centre, corner.unsqueeze(-1) + self._window, in_view
@@ -107,3 +141,16 @@ class Sensor(nn.Module):
         offset, count = sums.split((2, 1), -1)
         total = torch.addcmul(offset, count, centre.unsqueeze(-2))
         return count.squeeze(-1), total.div_(count.clamp(min=1)).float()
+
+
+def search_altitude(world: WildfireConfig) -> float:
+    """Returns the altitude at which a UAV in flight recognises the most cells in a step.
+
+    A cell of the strip in view is looked at as often as the UAV takes steps across its view. If
+    every cell is recognised, it is the maximum altitude.
+    """
+    low, high = (x[2].item() for x in motion.corners(world.low, world.high))
+    altitude = torch.linspace(low, high, 61, dtype=torch.float64)
+    width = 2 * view_radius(1.0, world.view_angle) * altitude
+    missed = (1 - Sensor.of(world).recognition(altitude)) ** (width / world.displacement)
+    return altitude[(width * (1 - missed)).argmax()].item()

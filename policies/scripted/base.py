@@ -11,7 +11,7 @@ from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import motion
-from emberlink.envs.world.sensor import view_radius
+from emberlink.envs.world.sensor import search_altitude, view_radius
 
 
 class Scripted(TensorDictModuleBase):
@@ -40,8 +40,9 @@ class Scripted(TensorDictModuleBase):
         writes: list[Any] = [keys.ACTION]
         self.in_keys, self.out_keys = reads, writes
         low, high = motion.corners(self.world.low, self.world.high)
+        high[2] = search_altitude(self.world)
         self.radius = view_radius(high[2].item(), self.world.view_angle)
-        """half the side of the square in view from the maximum altitude, cells"""
+        """half the side of the square in view from the altitude of flight, cells"""
         self.stride = self.world.displacement
         """cells that a UAV flies with one action, along x, y and z each"""
         self.register_buffer("low", low)

@@ -19,7 +19,7 @@ _SLACK = 0.01  # cells; margin of the view, above the distance by which a waypoi
 class Lawnmower(Scripted):
     """Flies back and forth over strips of the map that are as wide as the view.
 
-    All UAVs fly at the maximum altitude. The map is divided into strips, and each strip into
+    All UAVs fly at the `search_altitude`. The map is divided into strips, and each strip into
     waypoints from which all of it is seen, however long a step is. The waypoints of all strips form
     one path, in boustrophedon order, and each UAV gets an equal part of it. A UAV flies to the
     first waypoint of its part, along the part to the last, and back. If there are more UAVs than

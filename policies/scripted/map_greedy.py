@@ -39,7 +39,7 @@ class MapGreedy(Scripted):
 
     UAVs choose anew whenever they can have flown 2 cells (every 10 steps at most), in the order of
     falling values. A UAV gives no weight to cells within 2 cells (along x and y) of the targets of
-    UAVs whose messages it has. All fly at the maximum altitude.
+    UAVs whose messages it has. All fly at the `search_altitude`.
 
     The targets are carried in the TensorDict under "_map_greedy_target", the maps in the policy.
 

@@ -130,9 +130,9 @@ class Oracle(Scripted):
     At every step each UAV is assigned a cell that no UAV has seen. The cost of a cell is its
     Chebyshev distance from the UAV plus 1000 cells for each step until it burns. So burning cells
     come first, then the cells that burn soonest. The UAV with the lowest cost chooses first and
-    reserves all cells in view from its cell at the maximum altitude, so that UAVs spread out. Ties
+    reserves all cells in view from its cell at that altitude, so that UAVs spread out. Ties
     go to the lower index of UAVs and of cells. A UAV without a cell stays at its position, and one
-    that has failed gets none. All UAVs fly at the maximum altitude.
+    that has failed gets none. All UAVs fly at the `search_altitude`.
 
     Where cells burn out, or with a base, `Foresight` chooses the targets.
 

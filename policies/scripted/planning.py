@@ -6,9 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.envs.world import motion
 from emberlink.envs.world.radio import PASSING
-from emberlink.envs.world.sensor import view_radius
+from emberlink.envs.world.sensor import search_altitude, view_radius
 
 HERE = 2.0
 """cells added to distances, so that no cell is at distance 0"""
@@ -18,7 +17,7 @@ class Targets(nn.Module):
     """Chooses the cell above which each UAV sees the highest sum of weights per cost.
 
     Args:
-        env: the environment; its grid and the view from the maximum altitude are used.
+        env: the environment; its grid and the view from the `search_altitude` are used.
         claim: cells within this distance of a UAV's target, along x and y, have no weight for
             other UAVs that know of the target.
     """
@@ -32,8 +31,7 @@ class Targets(nn.Module):
         super().__init__()
         world = env.config
         self._claim = claim
-        ceiling = motion.corners(world.low, world.high)[1][2].item()
-        radius = view_radius(ceiling, world.view_angle)
+        radius = view_radius(search_altitude(world), world.view_angle)
         for name, side in zip(("columns", "rows"), world.grid, strict=True):
             self.register_buffer(name, torch.arange(side).float(), persistent=False)
         for name, side in zip(("_view_x", "_view_y"), world.grid, strict=True):

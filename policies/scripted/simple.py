@@ -32,7 +32,7 @@ class RandomActions(Scripted):
 
 
 class RandomWaypoints(Scripted):
-    """Flies to random waypoints at the maximum altitude.
+    """Flies to random waypoints at the `search_altitude`.
 
     A UAV that is closer than 1 cell to its waypoint gets a new one. The waypoints are carried in
     the TensorDict under "_scripted_waypoint".

@@ -70,7 +70,8 @@ class TeamMaps(nn.Module):
         self.known.start_episodes(begins)
         position = tensordict.get(keys.POSITION).double()
         alive = tensordict.get(keys.ALIVE)
-        _, cells, in_view = self._sensor.look(position, self._start)
+        given = tensordict.get(keys.RNG_KEY), step
+        _, cells, in_view = self._sensor.look(position, self._start, *given)
         in_view &= (alive & ~begins.unsqueeze(-1)).unsqueeze(-1)
         hears = self._hears(tensordict, position, alive)
         self.known.update(View(cells, in_view, in_view), step, hears)

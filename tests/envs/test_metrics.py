@@ -20,6 +20,13 @@ def test_coverage_is_of_the_last_step():
     assert metrics.coverage_auc(seen, burning).item() == pytest.approx((0 + 75 + 75) / 3)
 
 
+def test_what_the_base_knows_is_averaged_over_steps():
+    seen, burnt = torch.tensor([0, 0, 10, 30]), torch.tensor([20, 40, 40, 40])
+    assert metrics.base_coverage(seen, burnt).item() == 75
+    # 0, 0, 25 and 75 %: coming home at the last moment counts for a quarter of the time
+    assert metrics.base_coverage_auc(seen, burnt).item() == 25
+
+
 @pytest.mark.parametrize(
     ("seen", "burning", "time"),
     [

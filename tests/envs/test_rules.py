@@ -62,7 +62,7 @@ def test_view_radius(altitude, radius):
 
 
 def test_count_classes():
-    view = Sensor((30, 20), view_angle=30.0, ceiling=4.0)  # a window of 5 x 5 cells
+    view = Sensor((30, 20), view_angle=30.0, altitude=(1.0, 4.0))  # a window of 5 x 5 cells
     classes = torch.zeros(2, 3, 5, 5, dtype=torch.bool)
     classes[0, 0, 0, 4] = classes[0, 0, 1, 4] = classes[0, 0, 4, 1] = True
     classes[1, 1] = True

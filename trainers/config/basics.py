@@ -25,6 +25,8 @@ class Basics:
     """name of the setup, a file in configs/setup"""
     world: Name
     """name of the world, a file in configs/world"""
+    edition: Count = 1
+    """edition of the world: another one has other rules or fires, so numbers do not compare"""
     replay: Literal["per_agent", "shared"]
     """whether each UAV has its own replay buffer, or all share one"""
     env: WildfireConfig

@@ -66,13 +66,16 @@ def in_world(config: RunConfig, world: str, **fire: Any) -> RunConfig:
     if world == config.world and not fire:
         return config
     setup = f"setup={config.setup}"
-    here = flat(to_values(resolve(config.method, [setup, f"world={config.world}", "fire=paper"])))
     there = resolve(config.method, [setup, f"world={world}"], **fire)
+    # The file of a world of another edition is gone: everything that the other world sets is taken.
+    origin = config.world if config.edition == there.edition else "paper"
+    here = flat(to_values(resolve(config.method, [setup, f"world={origin}", "fire=paper"])))
     values = to_values(config)
     for key, value in flat(to_values(there)).items():
         if key.startswith(("env.", "evaluation.")) and value != here.get(key):
             put(values, key, value)
-    return replace(from_values(values | {"world": world}), fire=there.fire)
+    changed = from_values(values | {"world": world, "edition": there.edition})
+    return replace(changed, fire=there.fire)
 
 
 def differences(

@@ -228,7 +228,8 @@ def scripted_config(config: RunConfig, name: str) -> RunConfig:
     recipe = SCRIPTED.find(name).recipe
     if recipe is None:
         steers = MODULES.find(config.comm["name"]).steer is not CommModule.steer
-        return replace(config, comm={"name": "no_comm"}) if steers else config
+        world = replace(config.env, observation="vector")  # no pictures, which nobody looks at
+        return replace(config, comm={"name": "no_comm"}, env=world) if steers else config
     if recipe == config.method:
         return config
     choices = [f"setup={config.setup}", f"world={config.world}", "fire=paper"]

@@ -23,7 +23,7 @@ from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.runs.checkpoint import load_weights, read_header
 from emberlink.trainers.runs.run_folder import RunFolder
 
-_CHANGEABLE = ("world", "fire", "env", "comm", "evaluation")
+_CHANGEABLE = ("world", "edition", "fire", "env", "comm", "evaluation")
 """groups of keys that an evaluation can change"""
 _UNITS = ("altitude", "horizon", "displacement", "view_angle", "observation_scale")
 

@@ -17,6 +17,7 @@ from jinja2 import Environment, StrictUndefined
 from numpy.typing import NDArray
 
 from emberlink.envs.utils.atomic_io import user_path
+from emberlink.envs.world.sensor import Sensor
 from emberlink.trainers.replay.recording import AGES, COUNTS, OF_BASE, ROLES, Episode
 
 SCRIPTS = ("unpack.js", "knowledge.js", "palette.js", "map.js", "curves.js", "replay.js")
@@ -103,6 +104,7 @@ def _panel(shown: Episode, arrays: "_Arrays") -> dict[str, Any]:
         "title": shown.title,
         "uavs": world.num_uavs,
         "base": None if world.base is None else list(world.base),
+        "side": Sensor.of(world).side,
         "slope": math.tan(math.radians(world.view_angle)),
         "fails": [int(step) for step in steps["alive"].sum(0)],
         "position": arrays.add(tracks, delta=True),
@@ -112,6 +114,8 @@ def _panel(shown: Episode, arrays: "_Arrays") -> dict[str, Any]:
     }
     if steps["lost"].any():
         panel["lost"] = arrays.add(_bits(steps["lost"]))
+    if "missed" in steps:
+        panel["missed"] = arrays.add(_bits(steps["missed"]))
     if "follows" in steps:
         panel["follows"] = arrays.add(_by_time(steps["follows"].astype(np.int8)))
     if "target" in steps:

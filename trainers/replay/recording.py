@@ -45,6 +45,8 @@ class Recording:
     - view: int [n, 4], the first and last cell in view along x, then along y; (1, 0, 1, 0) for none
     - hears: bool [r, r], whether a radio (row) heard another one (column); lost: bool [r, r],
       whether it was in range but the message was lost
+    - missed: bool [n, W, W], the cells of the view, from its first along x and y, that the UAV did
+      not recognise; only with `env.sensor`
     - `COUNTS` and `AGES`, `OF_BASE` with a base, `ADVICE` if the policy follows it
     """
 
@@ -58,9 +60,12 @@ class Recording:
         """The first step at which a UAV saw each cell while it burned, T + 1 for never, [X, Y]."""
         first = np.full_like(self.ignition, self.horizon + 1)
         for step in range(self.horizon, 0, -1):
-            for left, right, low, high in self.steps["view"][step].tolist():
+            for uav, (left, right, low, high) in enumerate(self.steps["view"][step].tolist()):
                 seen = np.s_[left : right + 1, low : high + 1]
                 burns = (self.ignition[seen] <= step) & (step < self.end[seen])
+                if "missed" in self.steps:
+                    missed = self.steps["missed"][step, uav]
+                    burns &= ~missed[: burns.shape[0], : burns.shape[1]]
                 first[seen][burns] = step
         return first
 
@@ -146,7 +151,9 @@ class Recorder:
         """Returns the views, links and ages of a time step of batch size [1]."""
         position, alive = now.get(keys.POSITION).double(), now.get(keys.ALIVE)
         key, step = now.get(keys.RNG_KEY), now.get(keys.STEP)
-        view = self._view(position, alive, step)
+        start = torch.zeros(1, 1, dtype=torch.int64)
+        whole = self._sensor.look(position, start)[2] & alive.unsqueeze(-1)
+        view = self._view(position, alive, key, step)
         if step > 0:  # nobody looks at the reset
             times = self._measures.times
             burnt, ended = (times.ignition <= step).sum(-1), (times.end == step).nonzero().unbind(1)
@@ -154,7 +161,7 @@ class Recorder:
             at = position[None], key, step[None], alive[None], burnt[None]
             self._measures.update(seen, (ended[0], ended[1]), *at)
         else:
-            view.in_view.zero_()
+            whole.zero_()
         if self._config.base is None:
             hears = radio.links(self._config.radio, position, key, step, alive=alive)
         else:
@@ -165,17 +172,33 @@ class Recorder:
         near &= lives.unsqueeze(-1) & lives.unsqueeze(-2)
         measured = self._measures.values(step)
         ages = {name: measured[key] for name, key in (AGES | OF_BASE).items() if key in measured}
-        return {"view": self._bounds(view), "hears": hears, "lost": near & ~hears, **ages}
+        bounds = self._bounds(view._replace(in_view=whole))
+        looks = {"view": bounds}
+        if self._config.sensor != (1.0, 1.0):
+            looks["missed"] = self._missed(view._replace(in_view=whole & ~view.in_view), bounds)
+        return {**looks, "hears": hears, "lost": near & ~hears, **ages}
 
-    def _view(self, position: Tensor, alive: Tensor, step: Tensor) -> View:
-        _, cells, in_view = self._sensor.look(position, torch.zeros(1, 1, dtype=torch.int64))
+    def _view(self, position: Tensor, alive: Tensor, key: Tensor, step: Tensor) -> View:
+        start = torch.zeros(1, 1, dtype=torch.int64)
+        _, cells, in_view = self._sensor.look(position, start, key, step)
         in_view &= alive.unsqueeze(-1)
         return View(cells, in_view, in_view & self._measures.times.burning(step)[0].take(cells))
 
+    def _on_map(self, view: View) -> Tensor:
+        """Returns the cells in view on the map, bool [n, X, Y]."""
+        seen = torch.zeros(view.cells.shape[1], self._sensor.area, dtype=torch.bool)
+        return self._sensor.crop(seen.scatter_(1, view.cells[0], view.in_view[0]))
+
+    def _missed(self, missed: View, bounds: Tensor) -> Tensor:
+        """Returns missed cells from the corner of each view on, bool [1, n, W, W]."""
+        side = self._sensor.side
+        on_map = torch.nn.functional.pad(self._on_map(missed), (0, side, 0, side))
+        corners = zip(on_map, bounds[0, :, ::2].tolist(), strict=True)
+        return torch.stack([m[x : x + side, y : y + side] for m, (x, y) in corners]).unsqueeze(0)
+
     def _bounds(self, view: View) -> Tensor:
         """Returns the first and last cells in view along x and y, int16 [1, n, 4]."""
-        seen = torch.zeros(view.cells.shape[1], self._sensor.area, dtype=torch.bool)
-        inside = self._sensor.crop(seen.scatter_(1, view.cells[0], view.in_view[0]))
+        inside = self._on_map(view)
         bounds = []
         for axis in (2, 1):
             line = inside.any(axis).int()

@@ -117,7 +117,7 @@ class Teacher(Transform):
 def find(name: str) -> type[MapGreedy]:
     """Returns the scripted policy of a name, which plans by the maps that UAVs share in range.
 
-    A policy that informs a base is none: UAVs of `maps` come home by themselves.
+    A policy that informs a base is none: with `comm.home`, UAVs come home by a rule.
 
     Raises:
         UserError: no teacher has this name; the message lists the known ones.

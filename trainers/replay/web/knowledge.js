@@ -4,11 +4,14 @@
 const NEVER = -1;
 const MEMORY = 2 ** 26; // bytes of all stored steps of a panel
 
-/** Calls a function with the index of each cell in view of a UAV at a step. */
+/** Calls a function with the index of each cell that a UAV recognises at a step. */
 function eachInView(panel, rows, step, uav, visit) {
   const [left, right, low, high] = [0, 1, 2, 3].map((side) => panel.view(step, uav * 4 + side));
   for (let x = left; x <= right; x++) {
-    for (let y = low; y <= high; y++) visit(x * rows + y);
+    for (let y = low; y <= high; y++) {
+      const place = (uav * panel.side + x - left) * panel.side + y - low;
+      if (!panel.missed?.(step, 0, place)) visit(x * rows + y);
+    }
   }
 }
 

@@ -5,7 +5,7 @@ const TYPES = {
   u4: Uint32Array, i4: Int32Array, f4: Float32Array,
 };
 const VERSION = 1;
-const BITS = ["hears", "lost"]; // a bit per step
+const BITS = ["hears", "lost", "missed"]; // a bit per step
 const NEEDED = ["position", "view", "hears", "reward", "seen", "burning", "burnt"];
 
 /** Returns the episodes that a text in base64 holds; throws an error if it is damaged. */
