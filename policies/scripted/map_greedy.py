@@ -12,7 +12,15 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import radio
 from emberlink.envs.world.knowledge import step_type
 from emberlink.policies.scripted.base import Scripted
-from emberlink.policies.scripted.planning import HERE, Rally, Targets, band, plan_period
+from emberlink.policies.scripted.planning import (
+    HERE,
+    REPORT,
+    Rally,
+    Targets,
+    band,
+    next_report,
+    plan_period,
+)
 from emberlink.policies.scripted.team_maps import Messages, TeamMaps
 
 _FLOWN = 2.0  # cells flown between two plans
@@ -151,6 +159,8 @@ class Courier(MapGreedy):
     """
 
     informs_base: ClassVar[bool] = True
+    every: ClassVar[int | None] = None
+    """steps from one chain to the next; None for one at the end of the episode"""
 
     _base: Tensor
 
@@ -179,4 +189,26 @@ class Courier(MapGreedy):
         """Returns where each UAV has to be at the end, given the fire and the UAVs it knows."""
         heard = self.maps.heard
         place, reach = radio.chain_to_fire(self.world, self._base, burning, step, heard)
-        return Rally(place, reach, torch.full_like(reach, self.world.horizon))
+        horizon = self.world.horizon
+        due = next_report(step, self.every or horizon, horizon)
+        return Rally(place, reach, due.expand_as(reach))
+
+
+class Shuttle(Courier):
+    """Searches as `courier`, and forms the chain every 250 steps: the base learns in time."""
+
+    every: ClassVar[int | None] = REPORT
+
+
+class ShuttleAlone(Shuttle):
+    """Searches as `shuttle`; each UAV knows its own sightings and target alone."""
+
+    hears: ClassVar[bool] = False
+    messages: ClassVar[Messages] = "none"
+
+
+class ShuttleAll(Shuttle):
+    """Searches as `shuttle`; each UAV knows what all have seen and plan, at any distance."""
+
+    hears: ClassVar[bool] = False
+    messages: ClassVar[Messages] = "everyone"

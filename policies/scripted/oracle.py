@@ -1,6 +1,7 @@
 """A scripted policy that knows the fire: an upper baseline of coverage."""
 
 import math
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -11,7 +12,14 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import radio
 from emberlink.envs.world.sensor import Sensor
 from emberlink.policies.scripted.base import Scripted
-from emberlink.policies.scripted.planning import HERE, Rally, Targets, plan_period
+from emberlink.policies.scripted.planning import (
+    HERE,
+    REPORT,
+    Rally,
+    Targets,
+    next_report,
+    plan_period,
+)
 
 _STEP_COST = 1000.0  # cells; above any distance on a map, so that burning cells come first
 _FLOWN = 1.0  # cells flown between two plans
@@ -33,14 +41,15 @@ class Foresight(nn.Module):
 
     Args:
         env: the environment; its fire and failures are read.
+        every: steps from one chain to the next; None for one at the end of the episode.
     """
 
     _base: Tensor
     _never: Tensor
 
-    def __init__(self, env: WildfireEnv):
+    def __init__(self, env: WildfireEnv, every: int | None = None):
         super().__init__()
-        self._env, self._world = (env,), env.config
+        self._env, self._world, self._every = (env,), env.config, every
         self.period = plan_period(_FLOWN, env.config.displacement)
         self._targets = Targets(env, claim=_CLAIM)
         self._sensor = Sensor.of(env.config)
@@ -58,7 +67,7 @@ class Foresight(nn.Module):
         cost, hears = distance + HERE, alive.unsqueeze(-1) & alive.unsqueeze(-2)
         if self._world.base is None:
             return self._targets.choose(ground, weight, cost, hears)[0]
-        rally = self._rally(ground)
+        rally = self._rally(ground, step)
         late = rally.too_late((self._targets.columns, self._targets.rows), arrives, speed)
         cost.masked_fill_(late, math.inf)
         target, value = self._targets.choose(ground, weight, cost, hears)
@@ -89,8 +98,8 @@ class Foresight(nn.Module):
         seen = (env.knowledge.seen_fire & has.unsqueeze(-1)).any(1)
         return ~self._sensor.crop(seen)
 
-    def _rally(self, ground: Tensor) -> Rally:
-        """Returns where each UAV has to be at the end, or before it fails."""
+    def _rally(self, ground: Tensor, now: Tensor) -> Rally:
+        """Returns where each UAV has to be at the next report, or before it fails."""
         (env,) = self._env
         horizon, uavs = self._world.horizon, ground.shape[1]
         fails = torch.full_like(ground[..., 0], horizon + 1)
@@ -103,7 +112,8 @@ class Foresight(nn.Module):
         friend = ground.gather(1, other.unsqueeze(-1).expand(-1, uavs, 2))
         place = torch.where(meets.unsqueeze(-1), friend, place)
         reach = torch.where(meets, _MEET * self._world.radio.range, reach)
-        step = torch.where(meets, fails - 1, math.inf).masked_fill_(lasting, horizon)
+        due = next_report(now, self._every or horizon, horizon)
+        step = torch.where(lasting, due, torch.where(meets, fails - 1, math.inf))
         return Rally(place, reach, step)
 
     def _chain(self, ground: Tensor, lasting: Tensor) -> tuple[Tensor, Tensor]:
@@ -140,6 +150,8 @@ class Oracle(Scripted):
         env: the environment that it acts in; its fire is read at every step.
     """
 
+    every: ClassVar[int | None] = None
+    """steps from one chain to the base to the next; None for one at the end of the episode"""
     TARGET = "_oracle_target"
     columns: Tensor
     rows: Tensor
@@ -148,7 +160,7 @@ class Oracle(Scripted):
         super().__init__(env)
         self._env = (env,)  # in a tuple, so that it is not registered as a submodule
         foresees = env.burn_out is not None or self.world.base is not None
-        self._foresight = Foresight(env) if foresees else None
+        self._foresight = Foresight(env, self.every) if foresees else None
         self.in_keys.append(keys.ALIVE)
         if foresees:
             self.out_keys.append(self.TARGET)
@@ -209,3 +221,9 @@ class Oracle(Scripted):
         near_x = (cell[:, :1] - self.columns).abs() <= self.radius
         near_y = (cell[:, 1:] - self.rows).abs() <= self.radius
         delay.masked_fill_(near_x.unsqueeze(-1) & near_y.unsqueeze(-2), math.inf)
+
+
+class OracleShuttle(Oracle):
+    """Flies as `oracle`, and forms the chain to a base every 250 steps."""
+
+    every: ClassVar[int | None] = REPORT

@@ -9,6 +9,8 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world.radio import PASSING
 from emberlink.envs.world.sensor import search_altitude, view_radius
 
+REPORT = 250
+"""steps from one report to a base to the next, for policies that report all the time"""
 HERE = 2.0
 """cells added to distances, so that no cell is at distance 0"""
 
@@ -90,6 +92,15 @@ def band(side: int, reach: float) -> Tensor:
     """Returns whether each two of `side` places in a row are at most `reach` apart, as 0 and 1."""
     place = torch.arange(side)
     return ((place.unsqueeze(-1) - place).abs() <= reach).float()
+
+
+def next_report(step: Tensor, every: int, horizon: int) -> Tensor:
+    """Returns the next multiple of `every`, at most the horizon, float32 [envs, 1].
+
+    Args:
+        step: int64 [envs], steps since the episode began.
+    """
+    return ((step // every + 1) * every).clamp(max=horizon).unsqueeze(-1).float()
 
 
 def plan_period(flown: float, displacement: float) -> int:

@@ -64,20 +64,29 @@ class Condition:
 def conditions(means: Means, headline: str) -> list[Condition]:
     """Returns the conditions of a world.
 
+    Of the policies that know the fire (`oracle…`), that merge all maps (`…_all`) or none
+    (`…_alone`), the best one counts: in a world with a base, those that report to it.
+
     Args:
         means: the measures of at least the four needed policies.
         headline: the world's headline measure, in %.
     """
-    best = max(means.keys() - {ORACLE}, key=lambda policy: means[policy][headline])
+
+    def best(belongs: Callable[[str], bool]) -> str:
+        return max(filter(belongs, sorted(means)), key=lambda policy: means[policy][headline])
 
     def condition(one: str, other: str, *bound: Any) -> Condition:
         share = 100 * means[one][headline] / max(means[other][headline], 1e-9)
         return Condition(f"{headline} of {one} / {other}", share, *bound)
 
+    oracle = best(lambda policy: policy.startswith(ORACLE))
+    merged, none = (
+        best(lambda policy, end=end: policy.endswith(end)) for end in ("_all", "_alone")
+    )
     return [
-        condition(RANDOM, ORACLE, MOST_AT_RANDOM, True),
-        condition(ALL, ALONE, 100 + LEAST_GAIN),
-        condition(ORACLE, best, 100 + LEAST_AHEAD),
+        condition(RANDOM, oracle, MOST_AT_RANDOM, True),
+        condition(merged, none, 100 + LEAST_GAIN),
+        condition(oracle, best(lambda policy: not policy.startswith(ORACLE)), 100 + LEAST_AHEAD),
     ]
 
 

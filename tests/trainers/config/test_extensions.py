@@ -186,6 +186,7 @@ def test_policies_of_other_packages_are_known(installed):
     own = {
         *("stationary", "random_actions", "random_waypoints", "lawnmower", "follow_target"),
         *("map_greedy_alone", "map_greedy", "map_greedy_all", "courier", "oracle"),
+        *("shuttle_alone", "shuttle", "shuttle_all", "oracle_shuttle"),
     }
     assert {*SCRIPTED.known()} == {*own, "still"}
     assert SCRIPTED.find("still").__name__ == "Still"
