@@ -11,8 +11,8 @@ from torchrl.envs import step_mdp
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.envs.config import RadioConfig
 from emberlink.envs.world import radio
-from emberlink.policies.scripted.map_greedy import Courier, MapGreedy
-from emberlink.policies.scripted.oracle import Oracle
+from emberlink.policies.scripted.map_greedy import Courier, MapGreedy, Shuttle, ShuttleAll
+from emberlink.policies.scripted.oracle import Oracle, OracleShuttle
 from emberlink.policies.scripted.planning import next_report
 
 NEVER = math.inf
@@ -98,6 +98,17 @@ def test_what_was_seen_is_at_the_base_in_the_end(kind):
     assert td[keys.BASE_SEEN].item() == td[keys.SEEN].item() == 63
     td = played(env, MapGreedy(env), 90, start)
     assert td[keys.BASE_SEEN].item() == 0
+
+
+@pytest.mark.parametrize("kind", [Shuttle, ShuttleAll, OracleShuttle])
+def test_shuttles_report_in_the_middle_of_an_episode(kind):
+    fire = torch.full((40, 40), NEVER)
+    fire[24:31, 16:25] = 0
+    env = WildfireEnv(1, base_world(horizon=300), fire, seed=1)
+    start = [[26.0, 20, 4], [25.0, 22, 4], [28.0, 18, 4]]
+    td = played(env, kind(env), 250, start)
+    assert td[keys.BASE_SEEN].item() == td[keys.SEEN].item() == 63
+    assert played(env, Courier(env), 250, start)[keys.BASE_SEEN].item() == 0
 
 
 def test_the_chain_closes_where_a_uav_has_failed():
