@@ -67,12 +67,15 @@ def in_world(config: RunConfig, world: str, **fire: Any) -> RunConfig:
         return config
     setup = f"setup={config.setup}"
     there = resolve(config.method, [setup, f"world={world}"], **fire)
-    # The file of a world of another edition is gone: everything that the other world sets is taken.
-    origin = config.world if config.edition == there.edition else "paper"
-    here = flat(to_values(resolve(config.method, [setup, f"world={origin}", "fire=paper"])))
+    here = [resolve(config.method, [setup, f"world={config.world}", "fire=paper"])]
+    if here[0].edition != config.edition:
+        # The file of the run's edition is gone: what the other world itself sets is taken, too.
+        here.append(resolve(config.method, [setup, "world=paper", "fire=paper"]))
+    origins = [flat(to_values(origin)) for origin in here]
     values = to_values(config)
     for key, value in flat(to_values(there)).items():
-        if key.startswith(("env.", "evaluation.")) and value != here.get(key):
+        differs = any(value != origin.get(key) for origin in origins)
+        if key.startswith(("env.", "evaluation.")) and differs:
             put(values, key, value)
     changed = from_values(values | {"world": world, "edition": there.edition})
     return replace(changed, fire=there.fire)

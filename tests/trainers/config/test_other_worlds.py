@@ -43,6 +43,15 @@ def test_settings_of_the_run_are_kept_unless_the_worlds_differ_in_them():
     assert in_world(run, "front") is run
 
 
+def test_a_run_of_an_earlier_edition_gets_the_rules_of_the_other_world():
+    first = ["edition=1", "env.knowledge=team", "env.sensor=[1,1]"]
+    run = resolve("maps", ["setup=strong", "world=front", *first])
+    moved, back = in_world(run, "relay"), in_world(run, "paper")
+    assert (moved.edition, moved.env.knowledge, moved.env.sensor) == (2, "own", (1.0, 0.1))
+    assert (back.edition, back.env.grid, back.evaluation.huygens) == (1, (30, 30), True)
+    assert in_world(run, "front") is run
+
+
 def test_a_radio_of_the_run_holds_for_the_methods_of_scripted_policies_too():
     run = resolve("maps", ["setup=tuned", "world=front", "env.radio.loss=0.3"])
     consensus = resolve("consensus", ["setup=tuned", "world=paper", "env.radio.loss=0.3"])
