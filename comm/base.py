@@ -121,13 +121,17 @@ class CommModule(TensorDictModuleBase):
         """
         return None
 
-    def take_part(self, steps: TensorDictBase) -> Heard:
-        """Takes part in successive time steps, batch size [steps, num_envs], one after another.
+    def take_part(self, steps: TensorDictBase, last: TensorDictBase) -> Heard:
+        """Takes part in successive time steps, one after another.
 
         A module may compute them together, with the same result.
+
+        Args:
+            steps: batch size [steps, num_envs].
+            last: the last of them, which is rewritten.
         """
-        bonus, sent, last = [], [], steps
-        for step in steps.unbind(0):
+        bonus, sent = [], []
+        for step in (*steps.unbind(0)[:-1], last):
             bonus.append(self.shaping(step))
             last = self.rewrite(step)
             sent.append(self.bytes_sent(last) if self.counts else None)
@@ -135,7 +139,9 @@ class CommModule(TensorDictModuleBase):
 
     def rewrite(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Enters what the UAVs see into their maps, if they have any, and calls `forward`."""
-        return self.show(self(self.look(tensordict.unsqueeze(0), tensordict)))
+        if self.maps is not None:
+            self.maps.look(tensordict)
+        return self.show(self(tensordict))
 
     def look(self, steps: TensorDictBase, last: TensorDictBase) -> TensorDictBase:
         """Enters what the UAVs see at time steps [steps, num_envs] into their maps.
@@ -225,21 +231,27 @@ class Communication(Transform):
         return tensordict if self._joined else self._steered(tensordict)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict if self._joined else self._stepped(next_tensordict.unsqueeze(0))[0]
+        if self._joined:
+            return next_tensordict
+        return self._stepped(next_tensordict.unsqueeze(0), next_tensordict)[0]
 
     def _steered(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the action to perform at a step."""
         action = self.module.steer(tensordict)
         return tensordict if action is None else tensordict.set(keys.ACTION, action)
 
-    def _stepped(self, steps: TensorDictBase) -> tuple[TensorDictBase, dict[Any, Tensor]]:
+    def _stepped(
+        self, steps: TensorDictBase, last: TensorDictBase
+    ) -> tuple[TensorDictBase, dict[Any, Tensor]]:
         """Communicates after steps of the environment, batch size [steps, num_envs].
 
         Returns:
             The last time step, and of all steps the entries that communication has changed.
         """
         self._listen(steps)
-        last, bonus, sent = self.module.take_part(steps)
+        if self.listens:
+            last.set(keys.HEARS, steps.get(keys.HEARS)[-1])
+        last, bonus, sent = self.module.take_part(steps, last)
         changed: dict[Any, Tensor] = {keys.REWARD: steps.get(keys.REWARD)}
         if bonus is not None:
             if self.module.world.failures:

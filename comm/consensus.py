@@ -125,8 +125,7 @@ class Consensus(CommModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self._rewrite(tensordict.unsqueeze(0), tensordict).last
 
-    def take_part(self, steps: TensorDictBase) -> Heard:
-        last: Any = steps[-1]
+    def take_part(self, steps: TensorDictBase, last: TensorDictBase) -> Heard:
         heard = self._rewrite(steps, self.look(steps, last))
         self.show(last)
         return heard

@@ -30,7 +30,7 @@ _DONE = ("done", "terminated", "truncated")
 
 
 class Moved(NamedTuple):
-    """What successive steps of the world have changed; batch shape [steps, envs]."""
+    """What steps of the world have changed; batch shape [steps, envs], or [envs] of one step."""
 
     time: Tensor
     alive: Tensor | None
@@ -44,6 +44,13 @@ class Moved(NamedTuple):
     """None at a reset"""
     base_seen: Tensor | None = None
     """None at a reset, and without a base"""
+
+
+def _last(part: Any) -> Any:
+    """Returns the last step of all tensors, [steps, ...] each, of a tuple."""
+    if isinstance(part, tuple):
+        return type(part)(*map(_last, part))
+    return None if part is None else part[-1]
 
 
 class WildfireEnv(EnvBase):
@@ -111,7 +118,7 @@ class WildfireEnv(EnvBase):
             )
         self._agent_done, self._staggered, self._shows_map = agent_done, staggered, true_map
         self._steer: Callable[[TensorDictBase], TensorDictBase] | None = None
-        self._communicate: Callable[[TensorDictBase], Any] | None = None
+        self._communicate: Callable[..., Any] | None = None
         self._fire_name = fire if isinstance(fire, str) else getattr(fire, "name", None)
         self._make_world(fire)
         self._make_specs()
@@ -243,12 +250,12 @@ class WildfireEnv(EnvBase):
         self._start_episodes(mask)
         start = self._start_positions(position)
         self._position.copy_(torch.where(mask[:, None, None], start, self._position))
-        time, position = self._time.clone().unsqueeze(0), self._position.float().unsqueeze(0)
+        time, position = self._time.clone(), self._position.float()
         hits, flies = torch.zeros_like(position, dtype=torch.bool), self._alive(time)
-        counts = self._map.seen_count.clone().unsqueeze(0), *self._map.count(time)
-        start = Moved(time, flies, position, hits, self._no_sighting(), *counts, None)
-        first: Any = self._snapshots(start)[0]
-        return first.update(self._measured())
+        counts = self._map.seen_count.clone(), *self._map.count(time), None
+        nothing = Sighting.nothing(position, self._side**2)
+        start = Moved(time, flies, position, hits, nothing, *counts)
+        return self._snapshot(start).update(self._measured())
 
     def _start_episodes(self, mask: Tensor) -> None:
         """Starts the next episode where a mask, bool [num_envs], is true."""
@@ -279,55 +286,44 @@ class WildfireEnv(EnvBase):
             return motion.random_points(key, self.n_agents, self._low, self._high)
         return motion.given_points(given, self._position.shape, self._low, self._high)
 
-    def _no_sighting(self) -> Sighting:
-        """Returns the sighting at reset: no UAV has looked yet."""
-        none = torch.zeros_like(self._position).unsqueeze(0)
-        classes = none.new_zeros((*none.shape, self._side**2), dtype=torch.bool)
-        return Sighting(none, none.new_zeros((*none.shape, 2), dtype=torch.float32), classes)
-
     def join(
         self,
         steer: Callable[[TensorDictBase], TensorDictBase] | None,
-        communicate: Callable[[TensorDictBase], tuple[TensorDictBase, dict[Any, Tensor]]],
+        communicate: Callable[..., tuple[TensorDictBase, dict[Any, Tensor]]],
     ) -> None:
         """Calls `steer` on the action before every step, and `communicate` on time steps.
 
-        `communicate` reads a batch [steps, num_envs]; it returns the last time step, and what it
-        has changed in all.
+        `communicate` reads time steps, [steps, num_envs], and the last of them; it returns the last
+        one, and what it has changed in all.
         """
         self._steer, self._communicate = steer, communicate
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Performs the steps of a held action: all at once, unless each is steered."""
+        if self.hold == 1:
+            now = self._advance(tensordict.get(keys.ACTION), 1)
+            return self._snapshot(_last(now)).update(self._measured())
         chosen, parts = tensordict.select(keys.ACTION), []
         result: Any = None
         for ahead in self._ahead.split(self.hold if self._steer is None else 1):
             steered = chosen if self._steer is None else self._steer(chosen.copy())
-            steps = self._snapshots(self._advance(steered.get(keys.ACTION), len(ahead)))
-            counted = steps.select(*metrics.counted(self.config))
-            if self._communicate is None:
-                result = steps[-1]
-            else:
-                result, changed = self._communicate(steps)
-                counted.update(changed)
-            parts.append(counted)
-        result.update(self._measured())
-        if self.hold > 1:
-            # [envs, steps], as the time steps of a rollout are
-            series: Any = torch.cat(parts).transpose(0, 1).contiguous()
-            result.set(keys.STEPS, series).set(keys.REWARD, series.get(keys.REWARD).sum(1))
-        return result
+            steps = self._snapshot(self._advance(steered.get(keys.ACTION), len(ahead)))
+            parts.append(steps.select(*metrics.counted(self.config)))
+            result = steps[-1]
+            if self._communicate is not None:
+                result, changed = self._communicate(steps, result)
+                parts[-1].update(changed)
+        # [envs, steps], as the time steps of a rollout are
+        series: Any = torch.cat(parts).transpose(0, 1).contiguous()
+        result.set(keys.STEPS, series).set(keys.REWARD, series.get(keys.REWARD).sum(1))
+        return result.update(self._measured())
 
     def _advance(self, action: Tensor, steps: int) -> Moved:
         """Performs successive steps of the world with the same action."""
         time = self._time + self._ahead[:steps]
-        alive, moves, hits = self._alive(time), [], []
-        for step in range(steps):
-            move = self._move(action, None if alive is None else alive[step])
-            self._position.copy_(move[0])
-            moves.append(move[0])
-            hits.append(move[1])
-        position, hit_boundary = torch.stack(moves), torch.stack(hits)
+        alive = self._alive(time)
+        moves = [self._move(action, alive if alive is None else alive[s]) for s in range(steps)]
+        position, hit_boundary = map(torch.stack, zip(*moves, strict=True))
         burning, burnt = self._map.count(time)
         look = self._map.look(position.double(), self._step_key, time, burning, alive)
         told = base_seen = None
@@ -348,16 +344,16 @@ class WildfireEnv(EnvBase):
         return None if self._fail_step is None else time.unsqueeze(-1) < self._fail_step
 
     def _move(self, action: Tensor, alive: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Returns the new positions and the axes of attempted exits; see `motion.move`."""
+        """Moves the UAVs; returns the positions and the axes of attempted exits, see `motion`."""
         if alive is not None:
             action = action.masked_fill(~alive.unsqueeze(-1), 0.0)
-        stride = self.config.displacement
-        return motion.move(
-            self._position, action, displacement=stride, low=self._low, high=self._high
-        )
+        box, stride = {"low": self._low, "high": self._high}, self.config.displacement
+        moved, hit_boundary = motion.move(self._position, action, displacement=stride, **box)
+        self._position.copy_(moved)
+        return moved, hit_boundary
 
-    def _snapshots(self, now: Moved) -> TensorDict:
-        """Returns the time steps after steps of the world, batch size [steps, num_envs]."""
+    def _snapshot(self, now: Moved) -> TensorDict:
+        """Returns the time steps after steps of the world, batch size [..., num_envs]."""
         position, sighting, time = now.position, now.sighting, now.time
         counts = sighting.counts.long()
         new, old, none = counts.unbind(-1)
@@ -383,10 +379,11 @@ class WildfireEnv(EnvBase):
             agents[keys.REWARD[1]] = now.reward
         done = self._done(time)
         if self._agent_done:
-            agents |= {k: v.unsqueeze(-1).repeat(1, 1, self.n_agents, 1) for k, v in done.items()}
+            each = (*position.shape[:-1], 1)
+            agents |= {k: v.unsqueeze(-2).expand(each).clone() for k, v in done.items()}
         root = {
             keys.AGENTS: TensorDict(agents, position.shape[:-1], self.device),
-            keys.RNG_KEY: self._step_key.repeat(len(time), 1),
+            keys.RNG_KEY: self._step_key.expand(time.shape).clone(),
             keys.STEP: time,
             keys.SEEN: now.seen,
             keys.BURNING: now.burning,

@@ -116,6 +116,13 @@ class Sighting(NamedTuple):
     burnt_out: Tensor | None = None
     """bool [..., W * W]: mask of the burnt-out cells in view; None if cells never burn out"""
 
+    @classmethod
+    def nothing(cls, position: Tensor, cells: int) -> "Sighting":
+        """Returns what UAVs with windows of so many cells have seen before they first look."""
+        none = torch.zeros_like(position)
+        classes = none.new_zeros((*none.shape, cells), dtype=torch.bool)
+        return cls(none.double(), none.new_zeros((*none.shape, 2)), classes)
+
     def shown(self) -> Tensor:
         """Returns the camera's view of the window, uint8 [..., W * W]; see `keys.SIGHT`."""
         new, old, none = self.classes.to(torch.uint8).unbind(-2)
