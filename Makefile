@@ -55,7 +55,7 @@ soak: $(INSTALLED)  ## kill, interrupt and damage trainings repeatedly (about ha
 	@OMP_NUM_THREADS=1 EMBERLINK_SOAK=1 $(BIN)/python -m pytest -q -n $(WORKERS) \
 		tests/envs/test_invariants.py tests/trainers/config/test_config_fuzz.py
 
-bench: $(INSTALLED)  ## run the benchmarks (about half an hour; BENCH="-k update" selects some)
+bench: $(INSTALLED)  ## run the benchmarks (some minutes; BENCH="-k vmas" selects some)
 	@$(BIN)/python -m pytest tests/benchmarks -q -p no:xdist -o python_files='bench_*.py' $(BENCH)
 
 guard: $(INSTALLED)  ## check that nothing has become slower (a few seconds)

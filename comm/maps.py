@@ -74,7 +74,7 @@ class Maps(CommModule):
         self.messages = CellMessages(*agents, self.maps.sensor.area, size)
         self.register_buffer("home", torch.zeros(*agents, 3, dtype=torch.float32))
         self.register_buffer("said", torch.zeros(agents, dtype=torch.int64))
-        base = torch.tensor(world.base or (0.0, 0.0))
+        base = torch.tensor(world.base or (0.0, 0.0), dtype=torch.float32)
         self.register_buffer("_base", base, persistent=False)
         self._brings_home = config.home and hears_home(world)
 

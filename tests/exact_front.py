@@ -25,7 +25,14 @@ def running(values, times):
 
 
 def exact_arrival(
-    grid: tuple[int, int], centre, radius: float, rates, azimuth, velocity, horizon: float
+    grid: tuple[int, int],
+    centre,
+    radius: float,
+    rates,
+    azimuth,
+    velocity,
+    horizon: float,
+    steps: int = STEPS,
 ) -> np.ndarray:
     """Returns the arrival times at the centres of the cells, [X, Y], steps.
 
@@ -34,16 +41,16 @@ def exact_arrival(
         azimuth: from times [T] to radians [T].
         velocity: from times [T] to the drift [T, 2].
     """
-    times = np.linspace(0, horizon, STEPS + 1)
+    times = np.linspace(0, horizon, steps + 1)
     normals = np.linspace(0, 2 * math.pi, NORMALS, endpoint=False)
     reach = radius + running(support(normals, *rates, azimuth(times)[:, None]), times)
     moved = np.asarray(centre) + running(velocity(times), times)
     points = np.stack(np.meshgrid(*(np.arange(side) for side in grid), indexing="ij"), -1)
-    unit = np.stack([np.cos(normals), np.sin(normals)]).astype(np.float32)
-    along = points.astype(np.float32) @ unit
+    unit = np.stack([np.cos(normals), np.sin(normals)])
+    along = points @ unit
     arrival, before = np.full(grid, math.inf), np.full(grid, math.inf)
     for k, time in enumerate(times):
-        outside = (along - (moved[k] @ unit + reach[k]).astype(np.float32)).max(-1)
+        outside = (along - (moved[k] @ unit + reach[k])).max(-1)
         new = (outside <= 0) & np.isinf(arrival)
         # Cells inside the initial disc have no earlier sample. The others were reached in between.
         part = before[new] / (before[new] - outside[new]) if k else 0.0

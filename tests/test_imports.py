@@ -66,20 +66,6 @@ def test_imports_have_no_side_effects(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-ROOMS = [
-    file.parent.relative_to(ROOT).as_posix()
-    for folder in FOLDERS
-    for file in sorted((ROOT / folder).rglob("*.py"))
-    if file.name == "__init__.py"
-]
-
-
-def test_every_folder_with_code_is_a_package():
-    folders = {file.parent for folder in FOLDERS for file in (ROOT / folder).rglob("*.py")}
-    # comm has no __init__.py: it would hide Jupyter's package of that name in this folder.
-    assert {folder.relative_to(ROOT).as_posix() for folder in folders} == {*ROOMS, "comm"}
-
-
 SOURCES = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
 
 

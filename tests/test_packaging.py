@@ -52,15 +52,8 @@ def copy_sources(target: Path) -> Path:
 
 
 def tracked_files() -> list[Path]:
-    """Returns the files that git does not ignore, or all files if there is no git."""
-    try:
-        listed = run(
-            *("git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"), cwd=ROOT
-        )
-    except (AssertionError, FileNotFoundError):
-        skip = {".venv", ".git", "runs", "build", "dist"}
-        files = (p for p in ROOT.rglob("*") if not skip & set(p.relative_to(ROOT).parts))
-        return sorted(p for p in files if "__pycache__" not in p.parts)
+    """Returns the files that git does not ignore."""
+    listed = run("git", "ls-files", "--cached", "--others", "--exclude-standard", "-z", cwd=ROOT)
     return sorted(ROOT / name for name in listed.split("\0") if name)
 
 

@@ -76,6 +76,20 @@ def test_communication_does_not_change_the_world(method):
         rewritten, bare = step_mdp(rewritten, keep_other=True), step_mdp(bare, keep_other=True)
 
 
+@pytest.mark.parametrize("reach", [torch.inf, 4.0])
+def test_a_uav_observes_its_own_vector_first(reach):
+    """Without limit, UAV 1 observes the vectors of UAVs 1, 2, …, 0; unheard ones are 0."""
+    mine, theirs = (
+        recipe("positional", **{"comm.own_first": own, "env.radio.range": reach}).reset()
+        for own in (True, False)
+    )
+    for uav in range(UAVS):
+        for place in range(UAVS):
+            other = (uav + place) % UAVS
+            shown = mine[keys.OBSERVATION][:, uav, 6 * place : 6 * place + 6]
+            assert shown.equal(theirs[keys.OBSERVATION][:, uav, 6 * other : 6 * other + 6])
+
+
 @pytest.mark.filterwarnings("error::UserWarning")
 @pytest.mark.parametrize("method", EVERY)
 def test_a_bandwidth_that_a_method_does_not_heed_causes_a_warning(method):

@@ -110,22 +110,3 @@ def check_knowledge(teller, known, stamp, place, env) -> None:
             assert stamp[env, uav, other] == step
             if step >= 0:
                 assert (place[env, uav, other] == 10.0 * step + other).all()
-
-
-@pytest.mark.parametrize("limit", [5, 16, 20])
-def test_all_is_said_in_the_end(limit):
-    """One UAV knows old cells of never seen fire; it goes on, and its position changes."""
-    area = 30
-    maps = Knowledge(envs=1, uavs=2, area=area, horizon=1203, fires=True)
-    maps.last_seen[0] = torch.tensor([[4 * 9 + 1] * area, [4 * 10 + 1] * area])
-    maps.seen_fire[0, 0] = True
-    near = torch.tensor([[[False, False], [True, False]]])
-    messages = CellMessages(1, 2, area, CELL_BYTES)
-    stamp, place = torch.tensor([[[9, -1]] * 2]), torch.zeros(1, 2, 2, 3)
-    for step in range(10, 200):
-        stamp[0, 0, 0] = step
-        cells, places = talk(messages, maps, (stamp, place), (near, near), limit)
-        assert (cells + places).max() <= limit
-        if limit >= PLACE_BYTES and step > 60:
-            assert step - stamp[0, 1, 0] < 60
-    assert maps.seen_fire[0, 1].all()

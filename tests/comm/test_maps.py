@@ -205,15 +205,6 @@ def test_a_batch_equals_single_environments():
     assert 5 <= max(td[keys.BYTES_SENT].max() for td in together) <= 64
 
 
-def test_pictures_are_drawn_when_they_are_due():
-    every = flight_of(range(4))
-    some = flight_of(range(4), hold=5)
-    for step, (one, two) in enumerate(zip(every, some, strict=True)):
-        drawn = every[step - step % 5]
-        assert two[keys.CROPS].equal(drawn[keys.CROPS])
-        assert one[keys.OBSERVATION].equal(two[keys.OBSERVATION])
-
-
 def test_failed_uavs_neither_see_nor_hear():
     position = torch.tensor([[[14.0, 15.0, 4.0], [15.0, 15.0, 4.0], [16.0, 15.0, 4.0]]])
     env = environment(burning(), position, failures=3.0)
@@ -239,6 +230,9 @@ def test_environments_out_of_phase_have_pictures_of_their_own():
         env.reset(td.set("_reset", torch.tensor([[True], [False]])), position=position)
         later = [TensorDict({keys.ACTION: action}, [2]) for action in actions[3:]]
         flights.append([env.step(step)["next"] for step in later])
-    for every, held in zip(*flights, strict=True):
+    for step, (every, held) in enumerate(zip(*flights, strict=True)):
         due = every[keys.STEP] % 5 == 0
         assert held[keys.CROPS][due].equal(every[keys.CROPS][due])
+        assert every[keys.OBSERVATION].equal(held[keys.OBSERVATION])
+        if step:
+            assert held[keys.CROPS][~due].equal(flights[1][step - 1][keys.CROPS][~due])

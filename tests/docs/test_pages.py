@@ -76,17 +76,6 @@ def test_the_keys_of_everything_that_can_be_chosen_are_listed(kind, name):
     assert listed or f"`{name}`" in text
 
 
-def test_a_range_is_written_out(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "docs" / "site"))
-    import reference_pages
-
-    rows = {row[0]: row for row in reference_pages._rows("run", "")}
-    assert rows["`env.grid`"][2].endswith("; 2 values, each whole number ≥ 8 and ≤ 256")
-    assert rows["`env.reward.exit`"][2].endswith("; number")
-    rows = {row[0]: row for row in reference_pages._rows("executor", "ray")}
-    assert rows["`executor.resources`"][1] == "`{}`"
-
-
 def test_no_line_is_a_comment():
     """MyST leaves out a line of text that begins with a percent sign, such as a wrapped `98 %`."""
     comment = re.compile(r"^\s*%.*", re.M)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from tensordict import TensorDict
-from torchrl.envs import ParallelEnv, SerialEnv, check_env_specs
+from torchrl.envs import SerialEnv, check_env_specs
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys, parallel_env
@@ -45,16 +45,6 @@ def test_both_ways_of_seeding_are_equivalent():
     assert starts(made).equal(starts(set_later)), "the next episode too"
     set_later.set_seed(None)
     assert not starts(make(seed=4)).equal(starts(set_later))
-
-
-@pytest.mark.heavy
-def test_the_workers_of_a_parallel_environment_differ():
-    workers = ParallelEnv(2, make)
-    try:
-        first = starts(workers)
-    finally:
-        workers.close()
-    assert not first[0].equal(first[1])
 
 
 @pytest.mark.filterwarnings("error")

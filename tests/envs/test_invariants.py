@@ -1,75 +1,21 @@
 """Tests invariants of every step for random configurations and actions."""
 
-import copy
-import functools
 import math
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from robustness import SOAK
+from test_config_fuzz import FUZZ, valid_values
 
 from emberlink.envs import keys
-from emberlink.envs.utils.config_files import known
 from emberlink.envs.world.coverage_map import with_burn_time
 from emberlink.trainers.build import build_env
-from emberlink.trainers.config.compose import from_values, resolve, to_values
+from emberlink.trainers.config.compose import from_values, to_values
 
-STEPS = 10_000_000 if SOAK else 40_000
-"""environment steps in all"""
 ENVS = 512 if SOAK else 64
-METHODS, SETUPS = known("method"), known("setup")
-
-
-@functools.cache
-def recipe(method: str, setup: str) -> dict:
-    return to_values(resolve(method, [f"setup={setup}"]))
-
-
-def random_settings(rng: np.random.Generator) -> dict:
-    """Returns a recipe with random valid values for all settings of the environment."""
-    method, setup = str(rng.choice(METHODS)), str(rng.choice(SETUPS))
-    values = copy.deepcopy(recipe(method, setup))
-    altitude = np.sort(rng.choice([0.01, 0.5, 1.0, 3.3, 7.0, 40.0], 2))
-    # Wide views from high altitude cover the whole map. This bounds the window, for speed.
-    angle = float(rng.choice([0.01, 15.0, 30.0, 45.0, 80.0]))
-    values["env"] |= {
-        "grid": [int(side) for side in rng.choice([8, 9, 13, 24], 2)],
-        "num_uavs": int(rng.choice([1, 2, 3, 7])),
-        "horizon": int(rng.choice([1, 2, 9, 14])),
-        "altitude": altitude.tolist(),
-        "view_angle": angle,
-        "displacement": float(rng.choice([1e-3, 0.1, 1.0, 5.5, 256.0])),
-        "observation_scale": str(rng.choice(["raw", "box"])),
-        "radio": {
-            "range": float(rng.choice([0.0, 3.0, 10.0, math.inf])),
-            "loss": float(rng.choice([0.0, 0.5, 1.0])),
-        },
-        "base": [None, [0.0, 0.0], [7.0, 3.5]][rng.integers(3)],
-        "failures": float(rng.choice([0.0, 0.5, 1.0])),
-        "measures": str(rng.choice(["paper", "all"])),
-    }
-    values["env"]["reward"] = {
-        "exit_axes": str(rng.choice(["xyz", "xy"])),
-        **{name: float(rng.normal(0, 50)) for name in ("new_fire", "old_fire", "no_fire", "exit")},
-    }
-    if values["comm"]["name"] == "consensus":
-        heading = ["folded_linear", "folded_exponential", "linear", "approach"]
-        values["comm"] |= {
-            "discoverer": str(rng.choice(["new_fire", "any_fire"])),
-            "jitter": float(rng.choice([0.0, 0.75, 1e6])),
-            "target": str(rng.choice(["absolute", "relative"])),
-            "agree": bool(rng.integers(2)),
-            "follow": str(rng.choice(["best", "nearest"])),
-            "wander": bool(rng.integers(2)),
-            "redraw": [None, 1, 7][rng.integers(3)],
-            "heading": {
-                "form": str(rng.choice(heading)),
-                "weight": float(rng.normal(0, 3)),
-                "circle": float(rng.choice([0.0, 3.0])),
-            },
-        }
-    return values
 
 
 def random_fire(rng: np.random.Generator, config, generator: torch.Generator):
@@ -151,21 +97,24 @@ def check(td, before, env, config, looked: torch.Tensor) -> None:
             assert value.isfinite().all(), key
 
 
-def play(seed: int, steps: int) -> int:
-    """Runs a random configuration for 1.5 episodes or more; returns the number of steps."""
+@pytest.mark.heavy
+@FUZZ
+@given(valid_values(), st.integers(0, 2**32))
+def test_the_invariants_hold(values, seed):
+    """Plays 1.5 episodes or more."""
     rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
-    config = from_values(random_settings(rng))
+    config = from_values(values)
+    assert to_values(config) == values  # no value was coerced or left out
     fire = random_fire(rng, config, generator)
     env = build_env(config, num_envs=ENVS, fire=fire, seed=seed, device="cpu")
-    td, before, taken = env.reset(), None, 0
+    td, before = env.reset(), None
     everywhere = torch.ones(ENVS, dtype=torch.bool)
     check(td, None, env, config.env, looked=~everywhere)
-    for _ in range(steps):
+    for _ in range(20):
         shape = torch.Size((ENVS, config.env.num_uavs, 3))
         td[keys.ACTION] = random_actions(shape, generator)
         before = td
         after = env.step(td)["next"]
-        taken += ENVS
         check(after, before, env, config.env, looked=everywhere)
         assert torch.equal(after["done"].squeeze(-1), after[keys.STEP] >= config.env.horizon)
         again = after["done"].squeeze(-1) | (torch.rand(ENVS, generator=generator) < 0.05)
@@ -176,19 +125,3 @@ def play(seed: int, steps: int) -> int:
             check(td, None, env, config.env, looked=~again)
             same = ~again
             assert torch.equal(td[keys.OBSERVATION][same], after[keys.OBSERVATION][same])
-    return taken
-
-
-def sweep(steps: int, first: int = 0) -> int:
-    """Runs random configurations until the given number of environment steps is reached."""
-    taken, seed = 0, first
-    while taken < steps:
-        taken += play(seed, steps=20)
-        seed += 1
-    return taken
-
-
-@pytest.mark.heavy
-@pytest.mark.parametrize("part", range(4))
-def test_the_invariants_hold(part):
-    assert sweep(STEPS // 4, first=1_000_000 * part) >= STEPS // 4

@@ -6,9 +6,6 @@ from torchrl.envs import check_env_specs
 
 from emberlink.envs import keys
 from emberlink.trainers import make_env
-from emberlink.trainers.build import build_env
-from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.training.setup import TrainingSetup
 
 METHODS = ["independent", "shared_memory", "positional", "consensus", "maps"]
 SMALL = {"observation": "map", "horizon": 30, "env.map.pixels": 8, "env.map.scales": [1, 3]}
@@ -69,43 +66,3 @@ def test_positional_shows_the_positions_that_a_uav_hears():
     # 255 - round(254 log(2) / log(1001)) after a step without news
     assert marks == [{(2, 0): 255}, {(3, 0): 255}, {(3, 0): 230}]
     assert sent == [12] * 6
-
-
-@pytest.mark.parametrize("method", ["independent", "positional", "maps"])
-def test_held_actions_equal_single_steps(method):
-    config = resolve(method, ["setup=strong", "env.observation=map", "env.horizon=20",
-                              "env.map.pixels=8", "fire.num_train_fires=2"])  # fmt: skip
-    of = {"num_envs": 2, "fire": config.fire, "seed": 1, "device": "cpu"}
-    every, held = (build_env(config, **of, hold=hold) for hold in (1, config.policy.hold))
-    one, two = every.reset(), held.reset()
-    for action in actions(2, 2, 6):
-        for _ in range(config.policy.hold):
-            one = every.step(one.set(keys.ACTION, action))["next"]
-        two = held.step(two.set(keys.ACTION, action))["next"]
-        for key in (keys.CROPS, keys.OBSERVATION):
-            assert one[key].equal(two[key])
-
-
-@pytest.mark.parametrize(
-    ("method", "learner", "more"),
-    [
-        ("independent", "mappo", ["policy.message=attention", "policy.memory=none"]),
-        ("positional", "ippo", []),
-        ("consensus", "imitation", ["learner.samples=16"]),
-        ("independent", "imitation", ["learner.samples=16"]),
-        (
-            "shared_memory",
-            "td3",
-            ["policy.memory=none", "learner.buffer_size=200", "learner.batch_size=8"],
-        ),
-    ],
-)
-def test_every_learner_learns_with_a_map(method, learner, more):
-    setup = TrainingSetup(resolve(method, [
-        "setup=strong", f"learner={learner}", "env.observation=map", "env.map.pixels=8",
-        "env.horizon=40", "num_envs=4", "episodes=2", *more,
-    ]))  # fmt: skip
-    before = [w.clone() for w in setup.learner.actor.module.parameters()]
-    setup.dry_run(80)
-    after = list(setup.learner.actor.module.parameters())
-    assert any(not w.equal(b) for w, b in zip(after, before, strict=True))

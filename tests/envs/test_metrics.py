@@ -9,17 +9,6 @@ from emberlink.trainers import make_env
 YES, NO = True, False
 
 
-def test_score_is_the_mean_over_uavs_and_steps():
-    reward = torch.tensor([[1.0, -4], [-10, 0], [-100, 2]])
-    assert metrics.mean_reward(reward).item() == pytest.approx(-111 / 6)
-
-
-def test_coverage_is_of_the_last_step():
-    seen, burning = torch.tensor([0, 30, 36]), torch.tensor([40, 40, 48])
-    assert metrics.coverage(seen, burning).item() == 75
-    assert metrics.coverage_auc(seen, burning).item() == pytest.approx((0 + 75 + 75) / 3)
-
-
 def test_what_the_base_knows_is_averaged_over_steps():
     seen, burnt = torch.tensor([0, 0, 10, 30]), torch.tensor([20, 40, 40, 40])
     assert metrics.base_coverage(seen, burnt).item() == 75
@@ -49,34 +38,12 @@ def test_coverage_without_fire_is_complete():
     assert metrics.coverage_auc(nothing, nothing).item() == 100
 
 
-def test_tracking():
-    on_fire = torch.tensor([[NO, NO, NO], [NO, YES, NO], [YES, NO, NO], [YES, YES, YES]])
-    assert metrics.tracking_first(on_fire).item() == 2
-    assert metrics.tracking_last(on_fire).item() == 4
-
-
 def test_a_uav_that_never_finds_fire_has_the_horizon():
     on_fire = torch.zeros(5, 3, dtype=torch.bool)
     assert metrics.tracking_first(on_fire).item() == 5
     on_fire[0, 1] = on_fire[2, 0] = YES
     assert metrics.tracking_first(on_fire).item() == 1
     assert metrics.tracking_last(on_fire).item() == 5
-
-
-def test_boundary_exits_include_every_attempt():
-    left = torch.tensor([[YES, NO], [YES, NO], [NO, YES], [YES, NO]])
-    assert metrics.boundary_exits(left).item() == (3 + 1) / 2
-
-
-def test_fire_losses_include_every_loss():
-    track = {
-        "twice": [YES, NO, YES, YES, NO, NO],
-        "never on": [NO, NO, NO, NO, NO, NO],
-        "stays": [NO, YES, YES, YES, YES, YES],
-        "thrice": [YES, NO, YES, NO, YES, NO],
-    }
-    on_fire = torch.tensor(list(track.values())).T
-    assert metrics.fire_losses(on_fire).item() == (2 + 0 + 0 + 3) / 4
 
 
 def by_hand(steps) -> dict[str, float]:

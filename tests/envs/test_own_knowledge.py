@@ -100,14 +100,3 @@ def test_nothing_that_a_uav_does_reaches_one_out_of_range(method, observation):
     one, two = seen(True), seen(False)
     for key, value in one.items():
         assert value.equal(two[key]), key
-
-
-def test_fire_that_a_teammate_has_seen_is_old_in_a_team_alone():
-    arrival = torch.full((SIDE, SIDE), torch.inf)
-    arrival[5, 5] = 0
-    for knowledge, flags in (("team", [[1, 0], [0, 1]]), ("own", [[1, 0], [1, 0]])):
-        world = WildfireConfig(grid=(SIDE, SIDE), num_uavs=2, knowledge=knowledge)
-        env = WildfireEnv(1, world, arrival, seed=0)
-        td = env.reset(position=torch.tensor([[5.0, 5.0, 2.0], [5.0, 5.0, 3.0]]))
-        td = env.step(td.set(keys.ACTION, torch.zeros(1, 2, 3)))["next"]
-        assert td[keys.OBSERVATION][0, :, 3:5].tolist() == flags

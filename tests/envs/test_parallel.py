@@ -38,6 +38,8 @@ def test_pettingzoo_parallel_api():
     assert isinstance(env, ParallelEnv)
     parallel_api_test(env, num_cycles=100)
     api_test(parallel_to_aec(small()), num_cycles=100)
+    config = WildfireConfig(grid=(12, 10), num_uavs=3, horizon=30, failures=3.0)
+    parallel_api_test(parallel_env(config=config, fire=FIRE), num_cycles=100)
 
 
 def test_pettingzoo_seeds():

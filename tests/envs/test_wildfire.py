@@ -93,16 +93,6 @@ def test_reset_starts_in_the_box_without_seen_cells():
     assert env.fire_map.eq(2).all()
 
 
-def test_an_episode_is_truncated_at_the_horizon_and_never_terminated():
-    steps = world(num_envs=2).rollout(50)["next"]
-    assert steps.batch_size == (2, 20)
-    expected = [False] * 19 + [True]
-    for env in range(2):
-        assert steps["truncated"][env, :, 0].tolist() == expected
-        assert steps["done"][env, :, 0].tolist() == expected
-    assert not steps["terminated"].any()
-
-
 def test_fire_by_name_by_config_and_by_arrival_times():
     scenario = load_scenario("paper")
     arrival = make_fires(scenario, torch.tensor([0]), (12, 12), 20)
@@ -117,8 +107,9 @@ def test_fire_by_name_by_config_and_by_arrival_times():
     assert WildfireEnv(1, None, torch.zeros(9, 17)).config.grid == (9, 17)
 
 
-def test_fires_of_a_bank_are_drawn_each_episode():
-    scenario = dataclasses.replace(load_scenario("huygens"), num_train_fires=3)
+@pytest.mark.parametrize("name", ["huygens", "reaction"])
+def test_fires_of_a_bank_are_drawn_each_episode(name):
+    scenario = dataclasses.replace(load_scenario(name), num_train_fires=3)
     env = world(scenario, 64)
     fires = []
     for _ in range(4):
@@ -168,11 +159,11 @@ def test_a_partial_reset_leaves_the_others_alone(method):
             assert (td[keys.POSITION][1] != before[keys.POSITION][1]).any()
         action = env.rand_action(td)[keys.ACTION]
         td, whole = (
-            step_mdp(e.step(x.set(keys.ACTION, action)), keep_other=True)
+            step_mdp(e.step(x.set(keys.ACTION, action)), keep_other=True, exclude_reward=False)
             for e, x in ((env, td), (twin, whole))
         )
     assert td[keys.STEP].tolist() == [8, 3, 8]
-    for key in (keys.OBSERVATION, keys.POSITION, keys.NEW_FIRE, keys.RNG_KEY):
+    for key in (keys.OBSERVATION, keys.POSITION, keys.NEW_FIRE, keys.RNG_KEY, keys.REWARD):
         assert td[key][::2].equal(whole[key][::2]), key
 
 

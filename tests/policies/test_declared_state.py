@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.collectors import Collector
 from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
 
@@ -104,19 +104,6 @@ def test_batched_environments_act_as_alone(policy, cls, collected):
     if not env.is_closed:
         env.close()
     assert torch.allclose(actions, alone(policy), atol=1e-5)
-
-
-@pytest.mark.heavy
-def test_multi_sync_collector_acts_as_alone(policy):
-    makers = [partial(make, policy.config, seed) for seed in (3, 4)]
-    collector = MultiSyncCollector(
-        makers, policy, frames_per_batch=2 * STEPS, total_frames=2 * STEPS, cat_results="stack"
-    )
-    try:
-        run = next(iter(collector))
-        assert torch.allclose(run[keys.ACTION].squeeze(1), alone(policy), atol=1e-5)
-    finally:
-        collector.shutdown()
 
 
 def inputs(policy, td):

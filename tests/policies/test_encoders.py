@@ -7,7 +7,7 @@ from torch import nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from emberlink.envs import keys
-from emberlink.policies.networks import make_actor, make_critic
+from emberlink.policies.networks import make_actor
 from emberlink.policies.networks.actor_critic import StackedActor
 from emberlink.policies.networks.encoders import (
     PictureEncoder,
@@ -80,20 +80,6 @@ def test_window_and_vector_equal_a_plain_network(shared, hidden):
         plain = PlainActor(actor.module, 0 if shared else uav)
         expected = plain(td[keys.OBSERVATION][:, uav], td[keys.WINDOW][:, uav])
         torch.testing.assert_close(actions[:, uav], expected, atol=1e-5, rtol=1e-5)
-
-
-@pytest.mark.parametrize("window", [False, True])
-def test_shared_weights_are_the_same_for_all_uavs(window):
-    observation, action = specs(4, window=window)
-    for make in (make_actor, make_critic):
-        generator = torch.Generator().manual_seed(1)
-        network = make(observation, action, HIDDEN, share_parameters=True, generator=generator)
-        assert {len(weight) for weight in network.parameters()} == {1}
-        scrambled(network)
-        td, (out,) = observed(4, UAVS), network.out_keys[-1:]
-        order = torch.tensor([2, 0, 1])
-        permuted = td.apply(lambda x, order=order: x[:, order])
-        torch.testing.assert_close(network(td)[out][:, order], network(permuted)[out])
 
 
 def test_pictures_pass_three_convolutions_with_weights_of_their_group():

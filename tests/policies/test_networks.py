@@ -1,52 +1,13 @@
-"""Compares the stacked networks with one torch.nn network per UAV."""
+"""Tests the networks' initial weights; test_ddpg.py compares them with plain torch modules."""
 
 import math
 
-import pytest
 import torch
-from single_ddpg import SingleActor, SingleCritic, copy_uav
 
-from emberlink.policies.networks.actor_critic import (
-    StackedActor,
-    StackedCritic,
-)
+from emberlink.policies.networks.actor_critic import StackedActor, StackedCritic
 
 UAVS, FEATURES, ACTIONS, HIDDEN = 4, 9, 3, (20, 12)
 SIZES = UAVS, [(FEATURES,)], ACTIONS, HIDDEN
-SINGLE = FEATURES, ACTIONS, HIDDEN
-
-
-def scrambled(network):
-    """Sets all parameters, the norms' included, to random values of ordinary size."""
-    generator = torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.uniform_(-0.7, 0.7, generator=generator)
-    return network
-
-
-@pytest.mark.parametrize("batch", [(), (5,), (2, 7)])
-def test_stacked_actors_equal_single_networks(batch):
-    stack = scrambled(StackedActor(*SIZES))
-    observation = torch.randn(*batch, UAVS, FEATURES)
-    actions = stack(observation)
-    assert actions.shape == (*batch, UAVS, ACTIONS)
-    for uav in range(UAVS):
-        single = copy_uav(stack, SingleActor(*SINGLE), uav)
-        expected = single(observation[..., uav, :])
-        torch.testing.assert_close(actions[..., uav, :], expected, atol=1e-6, rtol=1e-5)
-
-
-@pytest.mark.parametrize("batch", [(), (5,), (2, 7)])
-def test_stacked_critics_equal_single_networks(batch):
-    stack = scrambled(StackedCritic(*SIZES))
-    observation, action = torch.randn(*batch, UAVS, FEATURES), torch.randn(*batch, UAVS, ACTIONS)
-    values = stack(action, None, observation)
-    assert values.shape == (*batch, UAVS, 1)
-    for uav in range(UAVS):
-        single = copy_uav(stack, SingleCritic(*SINGLE), uav)
-        expected = single(observation[..., uav, :], action[..., uav, :])
-        torch.testing.assert_close(values[..., uav, :], expected, atol=1e-5, rtol=1e-5)
 
 
 def test_initial_weights_are_those_of_the_ddpg_paper():

@@ -4,7 +4,6 @@ import itertools
 import json
 import math
 import os
-from dataclasses import replace
 
 import pytest
 import torch
@@ -12,7 +11,6 @@ import torch
 from emberlink.envs import keys, metrics
 from emberlink.envs.fire.generator import fire_seeds, load_scenario, make_fires
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
@@ -106,20 +104,6 @@ def test_all_policies_have_the_same_fires_and_starts(cache, monkeypatch):
     assert alone.reset()["agents", "position"][0].tolist() == begun[0][0][2]
 
 
-def test_follow_target_uses_the_consensus_of_the_setup():
-    base = small("consensus", "env.radio.range=3")
-    assert evaluate.scripted_config(base, "follow_target") == base
-    for method in ("independent", "shared_memory", "positional"):
-        for setup in ("paper", "released", "tuned"):
-            config = resolve(method, [f"setup={setup}", "env.num_uavs=4"])
-            changed = evaluate.scripted_config(config, "follow_target")
-            assert changed.comm == resolve("consensus", [f"setup={setup}"]).comm
-            assert changed.env.radio == resolve("consensus", [f"setup={setup}"]).env.radio
-            assert replace(changed, comm=config.comm, env=config.env) == config
-            for name in {*SCRIPTED.known()} - {"follow_target"}:
-                assert evaluate.scripted_config(config, name) is config
-
-
 def test_no_rule_of_a_method_changes_the_flight_of_a_scripted_policy(cache):
     """In `maps`, UAVs would fly home."""
     measured = []
@@ -187,25 +171,16 @@ RESULTS = {
 NUMBERS = ["-123.5", *["1000.0"] * 6, "499.5"]
 
 
-@pytest.mark.parametrize("columns", ["40", "64", "80", "120"])
+@pytest.mark.parametrize("columns", ["40", "120"])
 def test_narrow_tables_keep_every_number(columns, monkeypatch, capsys):
     config = resolve("shared_memory", ["setup=released"])
     monkeypatch.setenv("COLUMNS", columns)
     scores.print_results(SafeConsole(), RESULTS, config)
     lines = capsys.readouterr().out.splitlines()
-    parts = sum(line.startswith("oracle ") for line in lines)
-    assert (parts > 1) == (columns != "120")
     assert max(map(len, lines)) <= int(columns)
-    for policy in ("shared_memory", *POLICIES):
-        # A name may take two lines.
-        heads = (f"{policy} ", f"{policy.partition('_')[0]}_ ")
-        rows = [line.split() for line in lines if line.startswith(heads)]
-        assert len(rows) in (parts, 2 * parts)  # two of the names begin with "random_"
-        rows = rows[:: len(rows) // parts]
-        assert [number for row in rows for number in row[1:]] == NUMBERS
-    words = " ".join(lines).replace("_", " ").split()
-    for name in metrics.NAMES:
-        assert set(name.split("_")) <= set(words), name
+    words = " ".join(lines).split()
+    for number in ("-123.5", "1000.0", "499.5"):
+        assert words.count(number) == NUMBERS.count(number) * (1 + len(POLICIES))
 
 
 def test_validation_has_fires_and_starts_of_its_own(cache, monkeypatch):

@@ -152,7 +152,7 @@ def test_the_hydra_state_of_a_program_is_kept(tmp_path):
     (tmp_path / "mine.yaml").write_text("answer: 42\n")
     with hydra.initialize_config_dir(str(tmp_path), version_base="1.2"):
         mine = GlobalHydra.instance().hydra
-        env = trainers.make_env("consensus", "tuned", horizon=3)
+        env = trainers.make_env("consensus", "tuned", horizon=3, num_train_fires=2)
         assert env.rollout(2).shape == (1, 2)
         assert GlobalHydra.instance().hydra is mine
         assert hydra.compose("mine").answer == 42

@@ -23,15 +23,6 @@ def test_a_name_without_spaces_is_not_broken(capsys, monkeypatch):
 LINE = {"coverage": 45.06, "mean_reward": -1.234, "front/coverage": 50.0, "front/front_age": 40.0}
 
 
-def test_a_file_gets_a_line_per_episode_and_evaluation(capsys):
-    with TrainingProgress(SafeConsole(), steps=200, episodes=2, headline="front_age") as progress:
-        progress.step(100)
-        progress.episode(1, LINE)
-    first, second = capsys.readouterr().out.splitlines()
-    assert first.startswith("episode 1/2: coverage 45.1 %, mean reward -1.23")
-    assert second == "  without noise, on validation fires: front_age front 40.0"
-
-
 def test_a_terminal_shows_a_bar_and_the_lines(monkeypatch):
     stream = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", newline="\n")
     monkeypatch.setattr(sys, "stdout", stream)

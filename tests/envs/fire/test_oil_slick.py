@@ -98,19 +98,6 @@ def test_agrees_with_the_exact_solution(case: str):
         assert float((got - want)[a & b & (want > 0)].abs().mean()) / HORIZON < 0.006
 
 
-def test_no_drift_equals_a_drift_of_zero():
-    """Compares bit for bit, with fuel and turning wind."""
-    start = disc(torch.tensor([[11.3, 10.0]]), torch.tensor([4.0]))
-    rates = torch.tensor([0.006]), torch.tensor([2.5])
-    field = torch.rand(1, 24, 24, generator=torch.Generator().manual_seed(2))
-    options = {"horizon": 1000, "rate_field": field, "max_rate": 0.006}
-    wind = lambda time: torch.tensor([time / 900])  # noqa: E731
-    still = arrival_times(start, (24, 24), *rates, wind, **options)
-    zero = arrival_times(start, (24, 24), *rates, wind, **options, drift=torch.zeros(1, 2))
-    assert torch.equal(still, zero)
-    assert still.isfinite().sum() > 60
-
-
 # Number of burning cells and sum of their arrival times, computed before drift was introduced.
 UNCHANGED = [
     ("paper", fire_seeds("train", 1), (30, 30), 1000, 141, 33533.2004),

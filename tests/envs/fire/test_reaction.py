@@ -8,9 +8,7 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from emberlink.envs import WildfireConfig, WildfireEnv, keys
-from emberlink.envs.fire.cache import fire_bank
-from emberlink.envs.fire.generator import fire_seeds, load_scenario, make_fires
+from emberlink.envs.fire.generator import fire_seeds, load_scenario
 from emberlink.envs.fire.reaction import (
     ReactionConfig,
     advance,
@@ -193,19 +191,3 @@ def test_temperature_and_fuel_stay_positive_and_bounded(
         assert (rise <= limit).all()
         assert (fuel >= 0).all()
         assert (fuel <= 1).all()
-
-
-def test_a_bank_is_cached_and_an_environment_plays_it(tmp_path, monkeypatch):
-    monkeypatch.setenv("EMBERLINK_CACHE", str(tmp_path))
-    scenario = dataclasses.replace(CONFIG, num_train_fires=2)
-    world = WildfireConfig(grid=(12, 10), horizon=5)
-    env = WildfireEnv(3, config=world, fire=scenario, seed=0)
-    td = env.rand_action(env.reset())
-    assert env.step(td)["next"][keys.OBSERVATION].isfinite().all()
-    (file,) = tmp_path.glob("fire-*.npy")
-    stamp = file.stat().st_mtime_ns
-    bank = fire_bank(scenario, "train", 2, (12, 10), 5)
-    assert torch.equal(bank, make_fires(scenario, fire_seeds("train", 2), (12, 10), 5))
-    assert bank.shape == (2, 2, 12, 10)
-    assert env.burn_out.equal(bank[:, 1][env._map._fire_index])
-    assert file.stat().st_mtime_ns == stamp

@@ -2,8 +2,10 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from exact_front import exact_arrival, support
 from torch import Tensor
 
 from emberlink.envs.fire.level_set import arrival_times, disc, ellipse_rates, length_to_breadth
@@ -12,51 +14,28 @@ SIDE, CORE, HEAD, HORIZON = 30.0, 3.0, 0.01, 1000.0
 STRAIGHT, TURNING = 0.0, math.pi
 
 
-def front_speed(normal, a, b, c, azimuth) -> Tensor:
-    """Returns the speed of a straight front along its outward normal: the support function."""
-    along = torch.cos(normal - azimuth)
-    return c * along + torch.sqrt(b**2 + (a**2 - b**2) * along**2)
-
-
-def exact_arrival(n: int, ratio: float, azimuth, horizon: float = HORIZON) -> Tensor:
-    """Returns the exact arrival in a domain of 30 x 30 with n nodes a side, float64 [n, n].
-
-    The front's support function is h(n, t) = h0(n) + integral of F(n, s); a point is reached when
-    the last of the half planes x·n <= h(n, t) contains it.
-    """
-    times = torch.linspace(0, horizon, 401, dtype=torch.float64)
-    scale, middle = (n - 1) / SIDE, (n - 1) / 2
-    rates = ellipse_rates(torch.tensor(HEAD * scale).double(), torch.tensor(ratio).double())
-    xs = torch.arange(n).double() - middle
-    arrival = torch.zeros(n, n, dtype=torch.float64)
-    for angle in torch.arange(0, 360, 0.75).double().deg2rad():
-        speed = front_speed(angle, *rates, azimuth(times))
-        grown = torch.cumulative_trapezoid(speed, times)
-        support = torch.cat([torch.zeros(1).double(), grown]) + CORE * scale
-        along = xs[:, None] * angle.cos() + xs[None, :] * angle.sin()
-        right = torch.searchsorted(support, along).clamp(1, 400)
-        part = (along - support[right - 1]) / (support[right] - support[right - 1])
-        time = torch.lerp(times[right - 1], times[right], part.clamp_min(0))
-        time = torch.where(along > support[-1], math.inf, time)
-        arrival = torch.maximum(arrival, torch.where(along <= support[0], 0.0, time))
-    return arrival
-
-
-def computed_arrival(n: int, ratio: float, azimuth, refine: int = 1, **more) -> Tensor:
+def computed_arrival(n: int, ratio: float, azimuth) -> Tensor:
     scale, middle = (n - 1) / SIDE, (n - 1) / 2
     start = disc(torch.full((1, 2), middle), torch.tensor([CORE * scale]))
     turning = lambda time: azimuth(torch.tensor([time]))  # noqa: E731
     args = torch.tensor([HEAD * scale]), torch.tensor([ratio]), turning
-    return arrival_times(start, (n, n), *args, horizon=HORIZON, refine=refine, **more)[0]
+    return arrival_times(start, (n, n), *args, horizon=HORIZON, refine=1)[0]
 
 
 def compare(n: int, ratio: float, turn: float) -> tuple[float, float, float]:
     """Returns the ratio of areas, the intersection over union, and the mean error of arrival."""
 
-    def azimuth(time: Tensor) -> Tensor:
+    def azimuth(time):
         return 0.3 + turn * time / HORIZON
 
-    got, want = computed_arrival(n, ratio, azimuth), exact_arrival(n, ratio, azimuth)
+    def still(times):
+        return np.zeros((len(times), 2))
+
+    scale, middle = (n - 1) / SIDE, (n - 1) / 2
+    rates = [float(rate) for rate in ellipse_rates(HEAD * scale, ratio)]
+    start = (n, n), (middle, middle), CORE * scale
+    exact = exact_arrival(*start, rates, azimuth, still, HORIZON, steps=80)
+    got, want = computed_arrival(n, ratio, azimuth), torch.from_numpy(exact)
     a, b = got.isfinite(), want.isfinite()
     error = (got - want)[a & b & (want > 0)].abs().mean() / HORIZON
     return float(a.sum() / b.sum()), float((a & b).sum() / (a | b).sum()), float(error)
@@ -95,8 +74,9 @@ def test_front_speed_supports_the_wavelet(ratio: float):
     radius = (1 - eccentricity) / (1 - eccentricity * torch.cos(psi))
     normal = torch.linspace(0, 2 * math.pi, 37, dtype=torch.float64)
     reach = (radius * torch.cos(psi - normal[:, None])).amax(1)
-    rates = ellipse_rates(torch.tensor(1.0).double(), torch.tensor(ratio).double())
-    torch.testing.assert_close(front_speed(normal + 0.7, *rates, 0.7), reach, atol=1e-6, rtol=0)
+    rates = [float(rate) for rate in ellipse_rates(torch.tensor(1.0).double(), ratio)]
+    speed = torch.from_numpy(support((normal + 0.7).numpy(), *rates, 0.7))
+    torch.testing.assert_close(speed, reach, atol=1e-6, rtol=0)
 
 
 # Area ratio and intersection over union measured at n = 31, 61, 121, in docs/fire.md.
@@ -117,37 +97,14 @@ def test_agrees_with_the_exact_front_and_converges(ratio: float, turn: float, ov
     assert order > 1.3
 
 
-@pytest.mark.parametrize("ratio", [1.0, 2.0, 4.0])
-def test_area_grows_as_the_offset_of_a_disc(ratio: float):
-    """Compares the area with π r² + r · perimeter · t + π a b t², of a disc and the wavelet."""
-    arrival = computed_arrival(121, ratio, torch.zeros_like)
-    a, b, _ = (float(v) for v in ellipse_rates(HEAD, ratio))
-    angle = torch.linspace(0, 2 * math.pi, 3601)
-    perimeter = float(
-        torch.trapezoid(((a * angle.sin()) ** 2 + (b * angle.cos()) ** 2).sqrt(), angle)
-    )
-    for time in (250.0, 500.0, 1000.0):
-        want = math.pi * CORE**2 + CORE * perimeter * time + math.pi * a * b * time**2
-        assert float((arrival <= time).sum()) / 16 == pytest.approx(want, rel=0.006)
-
-
 def test_a_straight_front_moves_at_its_speed():
     front = lambda x, y: (x - 3.3) + 0 * y  # noqa: E731
     args = torch.tensor([0.01]), torch.tensor([2.0]), torch.tensor([1.0])
     got = arrival_times(front, (12, 9), *args, horizon=900)[0]
-    speed = float(front_speed(torch.tensor(0.0), *ellipse_rates(0.01, 2.0), 1.0))
+    speed = support(0.0, *map(float, ellipse_rates(0.01, 2.0)), 1.0)
     want = ((torch.arange(12.0) - 3.3) / speed).clamp_min(0)[:, None].expand(12, 9)
     want = want.masked_fill(want > 900, math.inf)
     torch.testing.assert_close(got, want, rtol=1e-4, atol=0.01)
-
-
-def test_mirror_and_quarter_turn():
-    base = grow(azimuth=0.4, centre=(11.0, 12.0))
-    torch.testing.assert_close(
-        grow(azimuth=-0.4, centre=(11.0, 11.0)).flip(1), base, rtol=0, atol=0.01
-    )
-    quarter = grow(azimuth=0.4 + math.pi / 2, centre=(11.0, 11.0))
-    torch.testing.assert_close(quarter.rot90(-1), base, rtol=0, atol=0.01)
 
 
 def test_symmetry_with_fuel_and_barriers():

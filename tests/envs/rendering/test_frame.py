@@ -1,8 +1,5 @@
 """Tests pictures of an environment: colours, orientation, size, GIF, video, window."""
 
-from pathlib import Path
-
-import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
@@ -70,7 +67,7 @@ def test_the_environment_draws_one_of_its_members():
 
 @pytest.mark.heavy
 def test_the_environment_draws_failed_uavs_and_the_base():
-    env = make_env("consensus", "tuned", world="blackout", seed=1)
+    env = make_env("consensus", "tuned", world="blackout", seed=1, num_train_fires=1)
     env.reset()
     env.base_env._fail_step.fill_(0)
     shown = {tuple(c) for c in env.base_env.render().reshape(-1, 3).tolist()}
@@ -91,11 +88,3 @@ def test_a_gif_has_every_frame(tmp_path):
         for index, expected in enumerate(frames):
             shown.seek(index)
             assert np.array_equal(np.asarray(shown.convert("RGB")), expected)
-
-
-def test_a_video_has_every_frame(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    name = "huygens:3.mp4"  # no address for ffmpeg
-    frames = [np.zeros((16, 16, 3), np.uint8)] * 3
-    film.write_mp4(Path(name), frames)
-    assert imageio_ffmpeg.count_frames_and_secs(tmp_path / name)[0] == 3

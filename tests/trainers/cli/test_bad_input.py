@@ -4,88 +4,79 @@ import subprocess
 import sys
 
 import pytest
+from refusal import refused
 from tiny_run import TINY
 
-from emberlink.trainers.cli import main
-
-
-def refused(arguments: list[str], capsys, *words: str) -> None:
-    """Runs a command that ends with status 2, and checks the words of its one line."""
-    capsys.readouterr()
-    try:
-        status = main.main(arguments)
-    except SystemExit as ended:
-        status = ended.code
-    out, err = capsys.readouterr()
-    assert (status, out, err.count("\n")) == (2, "", 1), err
-    assert len(err) < 400
-    for word in words:
-        assert word in err, err
-
-
-IMITATE = ["maps", "setup=tuned", "learner=imitation"]
+IMITATE = "train maps setup=tuned learner=imitation"
 METHODS = "known: consensus, independent, maps, positional, shared_memory"
+NOWHERE = "~nobody_here/x"
+HOME = ["~nobody_here", "home folder"]
+TRAININGS = [
+    ("consensu", ["'consensu'", "did you mean consensus?", METHODS]),
+    ("consensus maps", ["'maps'", "emberlink sweep consensus maps"]),
+    ("consensus learner.gama=0.9", ["'learner.gama'", "did you mean learner.gamma?"]),
+    ("consensus lr=0.1", ["'lr'", "learner.actor_lr or learner.critic_lr"]),
+    ("independent learner=ippo learner.tau=0.1", ["'learner.", "known: learner.name"]),
+    ("independent world=fornt", ["world 'fornt'", "did you mean front?"]),
+    ("independent env.failures=2.5", ["env.failures=2.5", "the team has 2 UAVs"]),
+    ("independent evaluation.scripted=[orcale]", ["orcale", "did you mean oracle?"]),
+    ("consensus learner.batch_size=1.5", ["learner.batch_size=1.5", "integer"]),
+    ("consensus env.grid=[4,30]", ["env.grid.0=4", "greater than or equal to 8"]),
+    ("consensus learner.buffer_size=5", ["batch_size=8", "buffer_size=5"]),
+    ("maps comm.range=0", ["'comm.range'", "did you mean env.radio.range?"]),
+    ("consensus comm.name=telepathy", ["telepathy", "known: consensus, maps, no_comm"]),
+    ("consensus seed=1,2", ["'seed=1,2'", "one value", "emberlink sweep"]),
+    ("consensus env.grid=30,20", ["one value", "in brackets"]),
+    ("consensus env.horizon=${nope}", ["nope", "env.horizon"]),
+]
+COMMANDS = [
+    ("trian", ["'trian'", "did you mean train?"]),
+    ("train", ["required: METHOD ("]),
+    ("train independent --episodes 5", ["--episodes", "key=value"]),
+    ("eval RUN --chekpoint x", ["did you mean --checkpoint?"]),
+    ("eval RUN --fires 65537", ["'65537' is not a whole number from 1 to 65536"]),
+    ("eval pretrained:maps evaluation.message_fault=zero", ["no learned messages"]),
+    ("list method", ["known: methods, setups"]),
+    ("sweep consensus setup=paper,tunned", ["tunned"]),
+    ("sweep consensus learner.gama=0.9,0.8", ["learner.gama"]),
+    ("sweep consensus seed=range(3,3)", ["no run: a key has no value"]),
+    ("sweep consensus seed=interval(0,5)", ["seed=interval(0,5)"]),
+    ("sweep consensus output=a,b", ["a sweep has one output folder"]),
+    ("sweep executor=slurm", ["executor='slurm' is not known; known: local"]),
+    ("sweep executor.workers=0", ["executor.workers=0"]),
+    ("sweep executor.nodes=2", ["'executor.nodes' is not known"]),
+    ("sweep executor=submitit executor.time=soon", ["executor.time="]),
+    ("world check mars", ["world 'mars'", "known: blackout, file"]),
+    ("world check front evaluation.scripted=[oracle]", ["lacks random_way"]),
+    ("world check front evaluation.headline=front_age", ["not a share in %"]),
+    ("world check front --json out.txt", ["must end in .json"]),
+    ("train consensus learner=imitation", ["env.observation=vector: the teacher"]),
+    ("train maps env.observation=vector", ["comm.name=maps exchanges the UAVs' maps"]),
+    (f"{IMITATE} learner.teacher=courier", ["known: map_greedy"]),
+    (f"{IMITATE} learner.samples=9 learner.buffer_size=8", ["buffer_size=8"]),
+    ("train maps learner=ippo learner.warm_start=no", ["learner.warm_start=no:"]),
+    (f"train independent output={NOWHERE}", HOME),
+    (f"train independent world=file setup=tuned fire.path={NOWHERE}", HOME),
+    (f"train independent learner=ippo learner.warm_start={NOWHERE}", HOME),
+    (f"train resume={NOWHERE}", HOME),
+    (f"eval {NOWHERE}", HOME),
+    (f"render {NOWHERE}", HOME),
+    (f"render pretrained:consensus --output={NOWHERE}.gif", HOME),
+    (f"compare {NOWHERE}", HOME),
+    (f"sweep independent output={NOWHERE}", HOME),
+    (f"fire import {NOWHERE} --output=fires.npy", HOME),
+    (f"world check --json={NOWHERE}.json", HOME),
+]
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["consensu"], ["'consensu'", "did you mean consensus?", METHODS]),
-        (["consensus", "maps"], ["'maps'", "emberlink sweep consensus maps"]),
-        (["consensus", "learner.gama=0.9"], ["'learner.gama'", "did you mean learner.gamma?"]),
-        (["consensus", "lr=0.1"], ["'lr'", "learner.actor_lr or learner.critic_lr"]),
-        (["independent", "learner=ippo", "learner.tau=0.1"], ["'learner.", "known: learner.name"]),
-        (["independent", "world=fornt"], ["world 'fornt'", "did you mean front?"]),
-        (["independent", "env.failures=2.5"], ["env.failures=2.5", "the team has 2 UAVs"]),
-        (["independent", "evaluation.scripted=[orcale]"], ["orcale", "did you mean oracle?"]),
-        (["consensus", "learner.batch_size=1.5"], ["learner.batch_size=1.5", "integer"]),
-        (["consensus", "env.grid=[4,30]"], ["env.grid.0=4", "greater than or equal to 8"]),
-        (["consensus", "learner.buffer_size=5"], ["batch_size=8", "buffer_size=5"]),
-        (["maps", "comm.range=0"], ["'comm.range'", "did you mean env.radio.range?"]),
-        (["consensus", "comm.name=telepathy"], ["telepathy", "known: consensus, maps, no_comm"]),
-        (["consensus", "seed=1,2"], ["'seed=1,2'", "one value", "emberlink sweep"]),
-        (["consensus", "env.grid=30,20"], ["one value", "in brackets"]),
-        (["consensus", "env.horizon=${nope}"], ["nope", "env.horizon"]),
+        # Short, in case the input is accepted.
+        *((["train", text.split()[0], *TINY, *text.split()[1:]], said) for text, said in TRAININGS),
+        *((text.split(), said) for text, said in COMMANDS),
     ],
-    ids=lambda value: " ".join(value) if len(value) < 4 else "",
-)
-def test_bad_input_gives_one_line_and_leaves_no_files(arguments, words, tmp_path, capsys):
-    method, *overrides = arguments
-    output = tmp_path / "runs"
-    # Short, in case the input is accepted.
-    refused(["train", method, *TINY, f"output={output}", *overrides], capsys, *words)
-    assert not output.exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["trian"], ["'trian'", "did you mean train?"]),
-        (["train"], ["required: METHOD ("]),
-        (["train", "independent", "--episodes", "5"], ["--episodes", "key=value"]),
-        (["eval", "RUN", "--chekpoint", "x"], ["did you mean --checkpoint?"]),
-        (["eval", "RUN", "--fires", "65537"], ["'65537' is not a whole number from 1 to 65536"]),
-        (["list", "method"], ["known: methods, setups"]),
-        (["sweep", "consensus", "setup=paper,tunned"], ["tunned"]),
-        (["sweep", "consensus", "learner.gama=0.9,0.8"], ["learner.gama"]),
-        (["sweep", "consensus", "seed=range(3,3)"], ["no run: a key has no value"]),
-        (["sweep", "consensus", "seed=interval(0,5)"], ["seed=interval(0,5)"]),
-        (["sweep", "consensus", "output=a,b"], ["a sweep has one output folder"]),
-        (["sweep", "executor=slurm"], ["executor='slurm' is not known; known: local"]),
-        (["sweep", "executor.workers=0"], ["executor.workers=0"]),
-        (["sweep", "executor.nodes=2"], ["'executor.nodes' is not known"]),
-        (["sweep", "executor=submitit", "executor.time=soon"], ["executor.time="]),
-        (["world", "check", "mars"], ["world 'mars'", "known: blackout, file"]),
-        (["world", "check", "front", "evaluation.scripted=[oracle]"], ["lacks random_way"]),
-        (["world", "check", "front", "evaluation.headline=front_age"], ["not a share in %"]),
-        (["world", "check", "front", "--json", "out.txt"], ["must end in .json"]),
-        (["train", "consensus", "learner=imitation"], ["env.observation=vector: the teacher"]),
-        (["train", "maps", "env.observation=vector"], ["comm.name=maps exchanges the UAVs' maps"]),
-        (["eval", "pretrained:maps", "evaluation.message_fault=zero"], ["no learned messages"]),
-        (["train", *IMITATE, "learner.teacher=courier"], ["known: map_greedy"]),
-        (["train", *IMITATE, "learner.samples=9", "learner.buffer_size=8"], ["buffer_size=8"]),
-        (["train", "maps", "learner=ippo", "learner.warm_start=no"], ["learner.warm_start=no:"]),
-    ],
+    ids=[text for text, _ in TRAININGS + COMMANDS],
 )
 def test_a_mistake_is_one_line_and_leaves_no_files(arguments, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -124,7 +115,7 @@ def test_an_output_folder_that_is_a_file(tmp_path, capsys):
 
 def test_invalid_run_folders(run, tmp_path, capsys):
     (tmp_path / "empty").mkdir()
-    refused(["eval", str(tmp_path / "nowhere")], capsys, "nowhere")
-    refused(["eval", str(tmp_path / "empty")], capsys, "empty")
-    refused(["eval", str(run), "--device", "cuda:99"], capsys, "cuda:99", "known: cpu")
-    refused(["eval", str(run), "--checkpoint", str(run / "none")], capsys, "none")
+    refused(["eval", tmp_path / "nowhere"], capsys, "nowhere")
+    refused(["eval", tmp_path / "empty"], capsys, "empty")
+    refused(["eval", run, "--device", "cuda:99"], capsys, "cuda:99", "known: cpu")
+    refused(["eval", run, "--checkpoint", run / "none"], capsys, "none")

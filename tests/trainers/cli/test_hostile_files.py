@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from refusal import refused
 from tiny_run import TINY
 
 from emberlink.envs.fire.cache import bank_key, fire_bank
 from emberlink.envs.fire.generator import load_scenario
-from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
 from emberlink.trainers.runs.run_folder import RunFolder
 
@@ -40,17 +40,12 @@ def mark(tmp_path) -> Path:
     return tmp_path / "mark"
 
 
-def refused(arguments: list[str], capsys, mark: Path) -> str:
+def harmless(arguments: list, capsys, mark: Path) -> str:
     """Returns the one-line error of a command and checks its time, its memory and the mark."""
-    capsys.readouterr()
     before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
-    status = main.main(arguments)
-    out, err = capsys.readouterr()
-    assert status == 2, (out, err)
-    assert err.count("\n") == 1, err
+    err = refused(arguments, capsys)
     assert err[:-1].isprintable(), err
     assert len(err) < 700
-    assert "Traceback" not in err
     assert time.monotonic() - began < 15
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
     assert not mark.exists()
@@ -99,9 +94,8 @@ CHECKPOINTS = {
 @pytest.mark.parametrize("kind", CHECKPOINTS)
 def test_a_checkpoint(kind, run, mark, capsys):
     RunFolder(run).checkpoint().write_bytes(CHECKPOINTS[kind](mark))
-    for command in (["eval"], ["train"]):
-        argument = f"resume={run}" if command == ["train"] else str(run)
-        assert "checkpoint.safetensors" in refused([*command, argument], capsys, mark)
+    for command in (["eval", run], ["train", f"resume={run}"]):
+        assert "checkpoint.safetensors" in harmless(command, capsys, mark)
 
 
 LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
@@ -129,7 +123,7 @@ def test_a_configuration(kind, run, mark, capsys):
     whole = yaml.safe_load(file.read_text())  # otherwise valid
     whole.pop(hostile.partition(":")[0], None)
     file.write_text(yaml.safe_dump(whole) + hostile)
-    assert "config.yaml" in refused(["train", f"resume={run}"], capsys, mark)
+    assert "config.yaml" in harmless(["train", f"resume={run}"], capsys, mark)
 
 
 LINES = {
@@ -143,7 +137,7 @@ LINES = {
 @pytest.mark.parametrize("kind", LINES)
 def test_the_lines_of_a_run(kind, run, mark, capsys):
     (run / "metrics.jsonl").write_text(LINES[kind])
-    assert "metrics.jsonl" in refused(["eval", str(run), "--fires", "1"], capsys, mark)
+    assert "metrics.jsonl" in harmless(["eval", run, "--fires", "1"], capsys, mark)
 
 
 EVALUATIONS = {
@@ -160,7 +154,7 @@ EVALUATIONS = {
 @pytest.mark.parametrize("kind", EVALUATIONS)
 def test_an_evaluation(kind, run, mark, capsys, tmp_path):
     (run / "eval.json").write_bytes(EVALUATIONS[kind](mark))
-    error = refused(["compare", str(run), "--output", str(tmp_path / "out")], capsys, mark)
+    error = harmless(["compare", run, "--output", tmp_path / "out"], capsys, mark)
     assert str(run / "eval.json") in error
     assert not (tmp_path / "out").exists()
 
@@ -168,6 +162,9 @@ def test_an_evaluation(kind, run, mark, capsys, tmp_path):
 BANKS = {
     "npy of objects": object_array,
     "code in the header": lambda _: header("__import__('os').mkdir('mark')"),
+    "shorter than its header says": lambda _: header(
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (1, 9, 9), }"
+    ),
     "far too large": lambda _: header(
         "{'descr': '<f4', 'fortran_order': False, 'shape': (1099511627776, 9, 9), }"
     ),
@@ -210,18 +207,8 @@ OVERRIDES = [
 @pytest.mark.parametrize("text", OVERRIDES, ids=lambda text: text[:30])
 def test_an_override(text, tmp_path, mark, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    refused(["train", "consensus", *TINY, text], capsys, mark)
+    harmless(["train", "consensus", *TINY, text], capsys, mark)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_scenario_with_a_tag(tmp_path, mark, monkeypatch):
-    text = f"name: !!python/object/apply:os.mkdir [{mark}]\n"
-    (tmp_path / "fire").mkdir()
-    (tmp_path / "fire" / "own.yaml").write_text(text)
-    monkeypatch.setenv("EMBERLINK_CONFIGS", str(tmp_path))
-    with pytest.raises(UserError, match=r"fire/own.yaml: .*python/object/apply"):
-        load_scenario("own")
-    assert not mark.exists()
 
 
 @pytest.mark.parametrize(
@@ -244,14 +231,9 @@ def test_a_run_folder_with_a_link_or_a_pipe_is_refused(name, kind, run, mark, ca
     else:
         targets = {"device": Path("/dev/zero"), "link": mine, "link to nothing": tmp_path / "new"}
         path.symlink_to(targets[kind])
-    out = str(tmp_path / "out")
-    for command in (
-        ["train", f"resume={run}", "episodes=3"],
-        ["eval", str(run)],
-        ["render", str(run)],
-    ):
-        assert f"{path}: a link, a pipe or a device" in refused(command, capsys, mark)
-    assert str(path) in refused(["compare", str(run), "--output", out], capsys, mark)
+    for command in (["train", f"resume={run}", "episodes=3"], ["eval", run], ["render", run]):
+        assert f"{path}: a link, a pipe or a device" in harmless(command, capsys, mark)
+    assert str(path) in harmless(["compare", run, "--output", tmp_path / "out"], capsys, mark)
     assert mine.read_text() == "mine"
     assert {p.name for p in tmp_path.iterdir()} <= {"mine", "run"}
 

@@ -7,6 +7,7 @@ import imageio_ffmpeg
 import numpy as np
 import torch
 from PIL import Image
+from refusal import refused
 
 from emberlink.envs.utils.config_files import known
 from emberlink.policies.scripted.base import SCRIPTED
@@ -118,16 +119,6 @@ def test_a_picture_of_another_grid(tmp_path, capsys):
         assert tuple(LINK) in {colour for _, colour in picture.convert("RGB").getcolors(256)}
 
 
-def refused(arguments, capsys, *words: str) -> None:
-    capsys.readouterr()
-    assert main.main(["render", *map(str, arguments)]) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("emberlink render: ")
-    assert err.count("\n") == 1, err
-    for word in words:
-        assert word in err, err
-
-
 def test_errors_of_render(tmp_path, capsys):
     run = make_run(tmp_path)
     wide = make_run(tmp_path, "consensus", "env.grid=[40,30]")
@@ -146,9 +137,9 @@ def test_errors_of_render(tmp_path, capsys):
         ([run, run, "--checkpoint", there], ["1 checkpoints for 2 runs"]),
     ]
     for arguments, words in cases:
-        refused(arguments, capsys, *words)
+        refused(["render", *arguments], capsys, *words)
     RunFolder(run).newest.unlink()
-    refused([run], capsys, "holds no checkpoint")
+    refused(["render", run], capsys, "holds no checkpoint")
     assert there.read_text() == "mine"
     assert not [*tmp_path.rglob("*.mp4"), *tmp_path.rglob("*.png")]
 
@@ -156,6 +147,6 @@ def test_errors_of_render(tmp_path, capsys):
 def test_a_failing_ffmpeg_gives_one_line(tmp_path, capsys, monkeypatch):
     run = make_run(tmp_path)
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "false")
-    refused([run, "--output", tmp_path / "a.mp4"], capsys, "a.mp4", "ffmpeg failed")
+    refused(["render", run, "--output", tmp_path / "a.mp4"], capsys, "a.mp4", "ffmpeg failed")
     assert not list(tmp_path.glob("*.mp4"))
     assert not list(tmp_path.glob(".*"))

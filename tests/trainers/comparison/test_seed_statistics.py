@@ -57,25 +57,6 @@ def test_iqm_of_few_seeds(values, expected):
     assert iqm(np.asarray(values, float)) == expected
 
 
-@pytest.mark.parametrize(
-    ("sample", "reference", "expected"),
-    [([2], [1], 1), ([1], [2], 0), ([1], [1], 0.5), ([1, 3], [2, 2], 0.5), ([1, 3], [1, 2], 0.625)],
-)
-def test_probability_of_improvement_by_hand(sample, reference, expected):
-    assert (
-        probability_of_improvement(np.asarray(sample, float), np.asarray(reference, float))
-        == expected
-    )
-
-
-def test_difference_of_iqms_by_hand():
-    # Of 5 and 4 values, the lowest and the highest are left out.
-    first, second = np.array([9.0, 0, 4, 5, 100]), np.array([[9.0], [2], [1], [-50]])
-    assert iqm_difference(first, second[:, 0]) == 6 - 1.5
-    assert iqm_difference(second[:, 0], first) == 1.5 - 6
-    np.testing.assert_array_equal(iqm_difference(first[:, None], second, axis=0), [4.5])
-
-
 @settings(deadline=None)
 @given(numbers, numbers)
 def test_statistics_equal_plain_python(sample, reference):
@@ -146,23 +127,3 @@ def test_the_crossed_interval_draws_seeds_and_the_same_fires():
     first, second = np.repeat(fires, 2, axis=0), np.zeros((2, 3))
     assert crossed_interval(mean_difference, first, second) == (0, 20)
     assert crossed_interval(mean_difference, first[:1], second) is None
-
-
-def test_the_crossed_interval_contains_the_truth_and_one_over_fires_does_not(monkeypatch):
-    """Of 200 simulated studies, each of two trainings with 10 seeds on 40 fires."""
-    monkeypatch.setattr(statistics, "RESAMPLES", 500)
-    generator = np.random.default_rng(0)
-    crossed = over_fires = 0
-    for _ in range(200):
-        hard = generator.normal(0, 3, 40)  # fires that are hard for both
-        samples = [
-            hard + sum(generator.normal(0, 1, shape) for shape in ((10, 1), (1, 40), (10, 40)))
-            for _ in range(2)
-        ]
-        low, high = crossed_interval(mean_difference, *samples) or (1, 1)
-        crossed += low <= 0 <= high
-        fires = [sample.mean(0) for sample in samples]
-        low, high = interval(mean_difference, *fires, resamples=500, paired=True)
-        over_fires += low <= 0 <= high
-    assert 180 <= crossed <= 198
-    assert over_fires < 160

@@ -10,7 +10,7 @@ from emberlink.envs.config import RewardConfig, WildfireConfig
 from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain
-from emberlink.trainers.config.compose import flat, from_values, resolve, to_values
+from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import build_comm
 from emberlink.trainers.config.values import REMOVED, check_not_removed
 
@@ -48,13 +48,8 @@ TABLE = {
 }
 GAMMA = {(method, setup): 0.95 for method in METHODS for setup in (PAPER, RELEASED)}
 GAMMA["independent", RELEASED] = 0.92
-# The methods: replay buffer and communication.
-SWITCHES = {
-    "independent": ("per_agent", "no_comm"),
-    "shared_memory": ("shared", "no_comm"),
-    "positional": ("shared", "positional"),
-    "consensus": ("shared", "consensus"),
-}
+COMM = {"independent": "no_comm", "shared_memory": "no_comm"}
+"""communication of a method, if it isn't its name"""
 CONSENSUS = {
     "discoverer": ("new_fire", "any_fire"),
     "jitter": (0.0, 0.75),
@@ -88,54 +83,42 @@ def test_every_row_of_the_table(method, column):
         assert dataclasses.asdict(settings) == OTHERS[method]
 
 
-CORRELATED = {"learner.exploration.theta": 0.1, "learner.exploration.sigma": 0.15}
+NOISE = {"learner.exploration.theta": 1.0, "learner.exploration.sigma": 0.35}
+PRICE = {"env.reward.new_fire": 1.0}
 OWN = {
-    PAPER: {},
-    RELEASED: {"independent": {"learner.gamma": 0.92}},
-    "tuned": {
-        "independent": {"env.reward.new_fire": 1.0},
-        "shared_memory": CORRELATED,
-        "positional": {"env.reward.new_fire": 1.0, **CORRELATED},
-        "consensus": {"learner.gamma": 0.9},
+    "independent": {"replay": "per_agent"},
+    "shared_memory": {},
+    "positional": {"env.radio.range": math.inf},
+    "consensus": {},
+    "maps": {
+        "env.observation": "map",
+        "learner.share_parameters": True,
+        "learner.buffer_size": 50_000,
     },
 }
-"""what a setup changes for one method, beside the two switches"""
+"""what distinguishes a method from shared_memory, beside its communication"""
+OF_SETUP = {
+    RELEASED: {"independent": {"learner.gamma": 0.92}},
+    "tuned": {
+        "independent": {**PRICE, **NOISE},
+        "positional": PRICE,
+        "consensus": {"learner.gamma": 0.9, **NOISE},
+        "maps": {**PRICE, **NOISE, "policy.hold": 10},
+    },
+}
+"""what a setup adds to that"""
 
 
-@pytest.mark.parametrize("setup", OWN)
-def test_methods_differ_only_in_listed_settings(setup):
-    every = {method: resolve(method, [f"setup={setup}"]) for method in METHODS}
-    common: dict[str, set[str]] = {}
-    for method, config in every.items():
-        assert (config.replay, config.comm["name"]) == SWITCHES[method]
-        listed = OWN[setup].get(method, {})
-        values = flat(to_values(config))
-        assert {key: values[key] for key in listed} == listed
-        for key in values.keys() - listed.keys():
-            if key.split(".")[0] not in ("method", "replay", "comm") and key != "env.radio.range":
-                common.setdefault(key, set()).add(repr(values[key]))
-    assert all(len(values) == 1 for values in common.values())
-    ranges = {method: config.env.radio.range for method, config in every.items()}
-    assert ranges == {**dict.fromkeys(METHODS, 10.0), "positional": math.inf}
-    for listed in OWN[setup].values():  # listed settings differ from those of the other methods
-        for key, value in listed.items():
-            assert repr(value) not in common.get(key, set())
-
-
-@pytest.mark.parametrize("setup", OWN)
-def test_maps_differ_from_the_other_methods_in_listed_settings(setup):
-    maps, other = (resolve(m, [f"setup={setup}"]) for m in ("maps", "shared_memory"))
-    values, others = flat(to_values(maps)), flat(to_values(other))
-    differ = {
-        key
-        for key, value in values.items()
-        if value != others.get(key) and key.split(".")[0] not in ("method", "comm")
-    }
-    own = {"env.observation", "learner.share_parameters", "learner.buffer_size"}
-    tuned = {"env.reward.new_fire", "policy.hold", *CORRELATED}
-    assert differ == own | (tuned if setup == "tuned" else set())
-    assert (maps.comm["name"], maps.replay, maps.env.observation) == ("maps", "shared", "map")
-    assert maps.policy.hold == (10 if setup == "tuned" else 1)
+@pytest.mark.parametrize("setup", [PAPER, RELEASED, "tuned"])
+@pytest.mark.parametrize("method", OWN)
+def test_methods_differ_only_in_listed_settings(method, setup):
+    values, others = (
+        flat(to_values(resolve(name, [f"setup={setup}"]))) for name in (method, "shared_memory")
+    )
+    differ = {key: value for key, value in values.items() if value != others.get(key)}
+    differ = {k: v for k, v in differ.items() if k.split(".")[0] not in ("method", "comm")}
+    assert differ == OWN[method] | OF_SETUP.get(setup, {}).get(method, {})
+    assert values["comm.name"] == COMM.get(method, method)
 
 
 def test_defaults_in_code_equal_setup_paper():
@@ -166,17 +149,6 @@ def test_every_key_of_a_configuration_can_be_set(choice):
     }
     assert {"env.reward.base", "env.radio.range"} <= values.keys()
     assert resolve("maps", chosen, **values) == config
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", [*METHODS, "maps"])
-def test_every_setup_composes_with_every_world(method):
-    for setup in known("setup"):
-        for world in known("world"):
-            fire = ["fire=front"] if world == "file" else []
-            config = resolve(method, [f"setup={setup}", f"world={world}", *fire])
-            assert (config.method, config.setup, config.world) == (method, setup, world)
-            assert from_values(to_values(config)) == config
 
 
 @pytest.mark.parametrize("key", REMOVED)

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-import torch
+from test_contract import check_that_it_learns_and_resumes
 
 from emberlink.envs.utils import config_files
 from emberlink.trainers.config.compose import resolve
@@ -42,25 +42,6 @@ def made() -> TrainingSetup:
     return TrainingSetup(resolve("consensus", SMALL))
 
 
-def test_it_trains_all_that_the_loss_registers(sac):
-    setup = made()
-    before = {name: value.clone() for name, value in setup.learner.loss.named_parameters()}
-    assert "log_alpha" in before
-    setup.dry_run(40)
-    assert setup.learner.updates > 20
-    for name, value in setup.learner.loss.named_parameters():
-        assert value.isfinite().all()
-        assert not value.equal(before[name]), name
-
-
-def test_it_resumes_bit_for_bit(sac):
-    whole, first, second = made(), made(), made()
-    whole.dry_run(40)
-    first.dry_run(20)
-    torch.manual_seed(5)
-    second.load_state_dict({k: v.clone() for k, v in first.state_dict().items()}, 20)
-    second.dry_run(20)
-    state = second.state_dict()
-    assert any(name.endswith("log_alpha") for name in state)
-    for name, value in whole.state_dict().items():
-        assert value.numpy().tobytes() == state[name].numpy().tobytes(), name
+def test_the_learner_of_the_page_trains_all_weights_and_resumes_bit_for_bit(sac):
+    assert "log_alpha" in dict(made().learner.loss.named_parameters())
+    check_that_it_learns_and_resumes(made)

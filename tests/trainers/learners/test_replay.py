@@ -139,23 +139,6 @@ def test_rows_are_the_transitions_of_the_environment():
         assert not row["next", "terminated"].any()
 
 
-@pytest.mark.parametrize("written", [20, 40, 55])
-def test_a_restored_memory_samples_like_the_saved_one(written):
-    def filled(rows: int) -> TeamReplay:
-        buffer = memory(shared=False, capacity=40, batch=10)
-        for first in range(rows):
-            buffer.extend(labelled(first, 1))
-        return buffer
-
-    saved, restored = filled(written), memory(shared=False, capacity=40, batch=10)
-    restored.load_state_dict({name: value.clone() for name, value in saved.state_dict().items()})
-    for buffer in (saved, restored):
-        for first in range(written, written + 15):
-            buffer.extend(labelled(first, 1))
-    assert (saved.sample() == restored.sample()).all()
-    assert len(saved) == len(restored)
-
-
 def test_rows_say_who_was_alive_after_a_step():
     env = make_env("independent", world="blackout", num_envs=2, seed=0, num_train_fires=2)
     first = env.reset()

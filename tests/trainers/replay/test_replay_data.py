@@ -7,8 +7,9 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 import torch
+from refusal import refused
 from small_episode import SIDES, STEPS, play_small
-from test_render_command import make_run, refused, rendered
+from test_render_command import make_run, rendered
 from unpack_replay import bit, data_of
 
 from emberlink.envs import keys
@@ -134,8 +135,8 @@ def test_render_writes_a_page_of_several_runs(tmp_path, capsys):
     assert [row[0] for row in with_radio["position"]] == [row[0] for row in without["position"]]
     assert any(map(any, with_radio["hears"]))
     assert not any(map(any, without["hears"]))
-    refused([run, "--output", tmp_path / "b.html", "--step", 3], capsys, "#t=3")
-    refused(["env.radio.range=0", run], capsys, "after the run")
+    refused(["render", run, "--output", tmp_path / "b.html", "--step", 3], capsys, "#t=3")
+    refused(["render", "env.radio.range=0", run], capsys, "after the run")
 
 
 def test_the_last_numbers_are_those_of_the_evaluation(tmp_path):

@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from refusal import refused
 from test_resume import REPLAY, begun, until
 
-from emberlink.trainers.cli import main
 from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.training.resume import resume
 
@@ -72,10 +72,7 @@ def test_two_trainings_in_one_folder(tmp_path, capsys):
     first = resume(run.path)
     try:
         before = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
-        assert main.main(["train", f"resume={run.path}"]) == 2
-        error = capsys.readouterr().err
-        assert f"process {os.getpid()}" in error
-        assert error.count("\n") == 1
+        refused(["train", f"resume={run.path}"], capsys, f"process {os.getpid()}")
         assert before == {p: p.read_bytes() for p in run.path.rglob("*") if p.is_file()}
     finally:
         first.close()

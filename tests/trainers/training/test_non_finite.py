@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from refusal import refused
 from test_resume import REPLAY, begun
 
-from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.rollout.finite_actions import NonFiniteActionError
@@ -62,7 +62,4 @@ def test_the_command_ends_with_one_line(tmp_path, capsys):
     wild = ["learner.actor_lr=1e30", "learner.critic_lr=1e30", "env.horizon=40", "episodes=2"]
     arguments = [*REPLAY, *wild, "num_envs=2", f"output={tmp_path}"]
     assert resolve("independent", arguments)
-    assert main.main(["train", "independent", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert "there is no checkpoint; train a new run with smaller learning rates" in error
+    refused(["train", "independent", *arguments], capsys, "there is no checkpoint")

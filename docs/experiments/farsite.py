@@ -1,6 +1,6 @@
 """Compares the level set with runs of FARSITE. Rates fitted on one run apply to all.
 
-    python tests/benchmarks/farsite.py FOLDER [--fit RUN] [--figure FILE.png]
+    python docs/experiments/farsite.py FOLDER [--fit RUN] [--figure FILE.png]
 
 FOLDER holds `RUN_ArrivalTime.asc`: ESRI ASCII grids of elapsed minutes, north up. The wind is read
 from the whole name RUN: in `3mph120deg7hr` it blows from 120° (0 is north, clockwise); in
