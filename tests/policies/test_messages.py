@@ -13,6 +13,8 @@ from emberlink.policies.networks.messages import message_bytes
 from emberlink.policies.networks.sequence import GaussianNetwork
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers import make_env
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.training.setup import TrainingSetup
 
 UAVS, FEATURES, SIZE, ENVS = 4, 6, 5, 2
 SCHEMES = ["mean", "attention"]
