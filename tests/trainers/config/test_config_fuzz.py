@@ -54,6 +54,7 @@ FIXED = {
     "env.radio.bandwidth": [None, 0, 50],
     "env.base": [None, [0.0, 7.0], [3.5, 0.25]],
     "env.failures": [0.0, 0.5, 1.0],
+    "env.sensor": [[1.0, 1.0], [0.9, 0.2]],
     "evaluation.scripted": [[], ["oracle"], ["map_greedy", "courier"]],
     "evaluation.headline": ["coverage", "fire_losses"],
     "learner.warm_start": [""],
