@@ -102,7 +102,7 @@ def shortened(words: list[str]) -> list[str]:
     if any(word.startswith("resume=") for word in rest) or verb not in SHORT:
         return [verb, *rest]
     short = SHORT[verb](rest)
-    return [verb, *short] if verb in ("train", "render") else [verb, *rest, *short]
+    return [verb, *short] if verb in ("train", "sweep", "render") else [verb, *rest, *short]
 
 
 def _train(rest: list[str]) -> list[str]:
@@ -128,7 +128,8 @@ SHORT = {
     "world": lambda _: ["env.horizon=5", "--fires", "2"],
     "fire": lambda rest: ["--count", "2"] * (rest[0] == "make"),
     "train": _train,
-    "sweep": lambda _: ["--dry-run"],
+    # Executors of clusters may not be installed.
+    "sweep": lambda rest: [*(w for w in rest if not w.startswith("executor")), "--dry-run"],
     "eval": _eval,
     "render": _render,
 }
