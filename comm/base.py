@@ -1,5 +1,6 @@
 """Defines communication modules and the transform that adds one to an environment."""
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -121,17 +122,13 @@ class CommModule(TensorDictModuleBase):
         """
         return None
 
-    def take_part(self, steps: TensorDictBase, last: TensorDictBase) -> Heard:
-        """Takes part in successive time steps, one after another.
+    def take_part(self, steps: Sequence[TensorDictBase]) -> Heard:
+        """Takes part in successive time steps, one after another, and rewrites the last one.
 
         A module may compute them together, with the same result.
-
-        Args:
-            steps: batch size [steps, num_envs].
-            last: the last of them, which is rewritten.
         """
-        bonus, sent = [], []
-        for step in (*steps.unbind(0)[:-1], last):
+        bonus, sent, last = [], [], steps[-1]
+        for step in steps:
             bonus.append(self.shaping(step))
             last = self.rewrite(step)
             sent.append(self.bytes_sent(last) if self.counts else None)
@@ -143,17 +140,6 @@ class CommModule(TensorDictModuleBase):
             self.maps.look(tensordict)
         return self.show(self(tensordict))
 
-    def look(self, steps: TensorDictBase, last: TensorDictBase) -> TensorDictBase:
-        """Enters what the UAVs see at time steps [steps, num_envs] into their maps.
-
-        Returns:
-            The last of them, with the vectors that the UAVs observe beside their maps.
-        """
-        if self.maps is not None:
-            for step in (*steps.unbind(0)[:-1], last):
-                self.maps.look(step)
-        return last
-
     def show(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Draws the UAVs' maps where they decide at a time step."""
         if self.maps is not None:
@@ -164,6 +150,11 @@ class CommModule(TensorDictModuleBase):
     def counts(self) -> bool:
         """Whether the bytes that UAVs send are measured."""
         return self.world.measures == "all" and self.world.radio.range > 0
+
+
+def of_steps(steps: Sequence[TensorDictBase], key: Any) -> Tensor:
+    """Returns an entry of successive time steps, [steps, num_envs, ...]."""
+    return torch.stack([step.get(key) for step in steps])
 
 
 def _stacked(parts: list[Tensor | None]) -> Tensor | None:
@@ -231,31 +222,26 @@ class Communication(Transform):
         return tensordict if self._joined else self._steered(tensordict)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        if self._joined:
-            return next_tensordict
-        return self._stepped(next_tensordict.unsqueeze(0), next_tensordict)[0]
+        return next_tensordict if self._joined else self._stepped([next_tensordict])[0]
 
     def _steered(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the action to perform at a step."""
         action = self.module.steer(tensordict)
         return tensordict if action is None else tensordict.set(keys.ACTION, action)
 
-    def _stepped(
-        self, steps: TensorDictBase, last: TensorDictBase
-    ) -> tuple[TensorDictBase, dict[Any, Tensor]]:
-        """Communicates after steps of the environment, batch size [steps, num_envs].
+    def _stepped(self, steps: Sequence[TensorDictBase]) -> tuple[TensorDictBase, dict[Any, Tensor]]:
+        """Communicates after successive steps of the environment.
 
         Returns:
-            The last time step, and of all steps the entries that communication has changed.
+            The last time step, and the entries of all steps that communication has changed,
+            [steps, num_envs, ...].
         """
         self._listen(steps)
-        if self.listens:
-            last.set(keys.HEARS, steps.get(keys.HEARS)[-1])
-        last, bonus, sent = self.module.take_part(steps, last)
-        changed: dict[Any, Tensor] = {keys.REWARD: steps.get(keys.REWARD)}
+        last, bonus, sent = self.module.take_part(steps)
+        changed: dict[Any, Tensor] = {keys.REWARD: of_steps(steps, keys.REWARD)}
         if bonus is not None:
             if self.module.world.failures:
-                bonus = bonus.masked_fill(~steps.get(keys.ALIVE), 0.0)
+                bonus = bonus.masked_fill(~of_steps(steps, keys.ALIVE), 0.0)
             changed[keys.REWARD] = changed[keys.REWARD] + bonus.unsqueeze(-1)
         changed |= self._bytes(steps, sent)
         for key, value in changed.items():
@@ -268,35 +254,32 @@ class Communication(Transform):
         module.reset(tensordict, mask)
         if module.maps is not None:
             module.maps.start_episodes(mask)
-        self._listen(tensordict)
+        self._listen([tensordict])
         heard = module.rewrite(tensordict)
         sent = module.bytes_sent(heard) if module.counts else None
-        for key, value in self._bytes(heard, sent).items():
-            heard.set(key, value)
+        sent = None if sent is None else sent.unsqueeze(0)
+        for key, value in self._bytes([heard], sent).items():
+            heard.set(key, value[0])
         return heard
 
-    def _listen(self, tensordict: TensorDictBase) -> None:
+    def _listen(self, steps: Sequence[TensorDictBase]) -> None:
         """Writes the links of time steps, if the module or the policy reads them."""
         world = self.module.world
         if self.listens:
-            links = radio.links(
-                world.radio,
-                tensordict.get(keys.POSITION),
-                tensordict.get(keys.RNG_KEY),
-                tensordict.get(keys.STEP),
-                alive=tensordict.get(keys.ALIVE) if world.failures else None,
-            )
-            tensordict.set(keys.HEARS, links)
+            at = (of_steps(steps, key) for key in (keys.POSITION, keys.RNG_KEY, keys.STEP))
+            alive = of_steps(steps, keys.ALIVE) if world.failures else None
+            for step, links in zip(steps, radio.links(world.radio, *at, alive=alive), strict=True):
+                step.set(keys.HEARS, links)
 
-    def _bytes(self, tensordict: TensorDictBase, sent: Tensor | None) -> dict[Any, Tensor]:
+    def _bytes(self, steps: Sequence[TensorDictBase], sent: Tensor | None) -> dict[Any, Tensor]:
         """Returns the bytes that the UAVs send, in a world in which they are measured."""
         world = self.module.world
         if world.measures != "all":
             return {}
-        alive = tensordict.get(keys.ALIVE)
+        alive = of_steps(steps, keys.ALIVE)
         total = torch.zeros_like(alive, dtype=torch.int64) if sent is None else sent * alive
         if self.message_bytes and world.radio.range:
-            decides = tensordict.get(keys.STEP) % self.module.hold == 0
+            decides = of_steps(steps, keys.STEP) % self.module.hold == 0
             total = total + self.message_bytes * (alive & decides.unsqueeze(-1))
         return {keys.BYTES_SENT: total}
 

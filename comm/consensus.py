@@ -1,6 +1,7 @@
 """Consensus communication: method 4 of the paper (section IV.F, algorithm 3)."""
 
-from typing import Annotated, Any, ClassVar, Literal
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import torch
 from pydantic import Field
@@ -9,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 
-from emberlink.comm.base import CommModule, Heard
+from emberlink.comm.base import CommModule, Heard, of_steps
 from emberlink.envs import keys
 from emberlink.envs.config import Number, WildfireConfig
 from emberlink.envs.utils import counter_rng
@@ -55,6 +56,27 @@ class ConsensusConfig:
     """steps after which random targets are drawn again, even if not reached; None for never"""
     heading: HeadingConfig = HeadingConfig()
     """the bonus for flying towards the target"""
+
+
+class TimeSteps(NamedTuple):
+    """What the module reads of successive time steps, [steps, num_envs, ...]; see `keys`."""
+
+    position: Tensor
+    hears: Tensor
+    rng_key: Tensor
+    step: Tensor
+    new_fire: Tensor
+    old_fire: Tensor
+    new_centre: Tensor
+    old_centre: Tensor
+    hit_boundary: Tensor
+
+    @classmethod
+    def of(cls, steps: Sequence[TensorDictBase]) -> "TimeSteps":
+        """Stacks the entries of time steps."""
+        fire = keys.NEW_FIRE, keys.OLD_FIRE, keys.NEW_CENTRE, keys.OLD_CENTRE
+        read = keys.POSITION, keys.HEARS, keys.RNG_KEY, keys.STEP, *fire, keys.HIT_BOUNDARY
+        return cls(*(of_steps(steps, key) for key in read))
 
 
 class Consensus(CommModule):
@@ -116,38 +138,45 @@ class Consensus(CommModule):
 
     def reset(self, tensordict: TensorDictBase, mask: Tensor) -> None:
         """Empties the track records and draws a random point for each UAV."""
-        key = self._step_key(tensordict, Use.WAYPOINT)
+        at = tensordict.get(keys.RNG_KEY), tensordict.get(keys.STEP)
+        key = counter_rng.step_key(*at, Use.WAYPOINT)
         points = motion.random_points(key, self.world.num_uavs, self.low, self.high)
         self.waypoint.copy_(torch.where(mask[:, None, None], points, self.waypoint))
         for record in (self.fire_score, self.altitude_sum):
             record.masked_fill_(mask[:, None], 0)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self._rewrite(tensordict.unsqueeze(0), tensordict).last
+        return self._rewrite([tensordict]).last
 
-    def take_part(self, steps: TensorDictBase, last: TensorDictBase) -> Heard:
-        heard = self._rewrite(steps, self.look(steps, last))
-        self.show(last)
+    def take_part(self, steps: Sequence[TensorDictBase]) -> Heard:
+        if self.maps is not None:
+            for step in steps:
+                self.maps.look(step)
+        heard = self._rewrite(steps)
+        self.show(heard.last)
         return heard
 
-    def _rewrite(self, steps: TensorDictBase, last: TensorDictBase) -> Heard:
+    def _rewrite(self, steps: Sequence[TensorDictBase]) -> Heard:
         """Rewrites the last time step; what depends on the step before is computed in turn."""
-        position, discovers = steps.get(keys.POSITION), self._discovers(steps)
-        known = known_discoverers(steps.get(keys.HEARS), discovers, agree=self.config.agree)
-        rank = self._update_track_record(steps, discovers)
-        cost = -rank.unsqueeze(-2) if self.config.follow == "best" else pairwise_distance(position)
+        read, last = TimeSteps.of(steps), steps[-1]
+        discovers = self._discovers(read.new_fire, read.old_fire)
+        known = known_discoverers(read.hears, discovers, agree=self.config.agree)
+        best = self.config.follow == "best"
+        rank = self._update_track_record(read, discovers)
+        cost = -rank.unsqueeze(-2) if best else pairwise_distance(read.position)
         follows = choose_leader(known, cost, discovers)
-        target = self._targets(steps, discovers, follows)
-        bonus = self._bonus(steps, discovers, follows, target)
+        target = self._targets(read, discovers, follows)
+        bonus = self._bonus(read, discovers, follows, target)
         sent = self._bytes(discovers, known) if self.counts else None
         relative = self.config.target == "relative"
-        shown = self._scaled(target[-1] - position[-1] if relative else target[-1])
+        shown = self._scaled(target[-1] - read.position[-1] if relative else target[-1])
         last.set(keys.OBSERVATION, torch.cat((last.get(keys.OBSERVATION), shown), -1))
         last.set(keys.FOLLOWS, follows[-1]).set(keys.TARGET, target[-1])
         return Heard(last, bonus, sent)
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
-        discovers = self._discovers(tensordict)
+        fire = (tensordict.get(key) for key in (keys.NEW_FIRE, keys.OLD_FIRE))
+        discovers = self._discovers(*fire)
         known = known_discoverers(tensordict.get(keys.HEARS), discovers, agree=self.config.agree)
         return self._bytes(discovers, known)
 
@@ -159,16 +188,13 @@ class Consensus(CommModule):
         passed_on = known.sum(-1) * self.config.agree
         return RECORD_BYTES * torch.where(discovers, 1, passed_on)
 
-    def _discovers(self, steps: TensorDictBase) -> Tensor:
+    def _discovers(self, new_fire: Tensor, old_fire: Tensor) -> Tensor:
         """Returns whether each UAV is a discoverer, bool [..., n]."""
-        fire = steps.get(keys.NEW_FIRE)
-        if self.config.discoverer == "any_fire":
-            fire = fire + steps.get(keys.OLD_FIRE)
-        return fire > 0
+        return (new_fire + old_fire if self.config.discoverer == "any_fire" else new_fire) > 0
 
-    def _update_track_record(self, steps: TensorDictBase, discovers: Tensor) -> Tensor:
+    def _update_track_record(self, steps: TimeSteps, discovers: Tensor) -> Tensor:
         """Adds the steps to the track records; returns ranks, float64 [steps, num_envs, n]."""
-        discovered, altitude = steps.get(keys.NEW_FIRE), steps.get(keys.POSITION)[..., 2].double()
+        discovered, altitude = steps.new_fire, steps.position[..., 2].double()
         records = []
         for new, height, counts in zip(discovered, altitude, discovers, strict=True):
             self.fire_score.add_(new).mul_(counts)
@@ -176,25 +202,25 @@ class Consensus(CommModule):
             records.append(self.fire_score / self.altitude_sum.clamp(min=1e-9))
         return torch.stack(records) * (discovered / altitude)
 
-    def _targets(self, steps: TensorDictBase, discovers: Tensor, follows: Tensor) -> Tensor:
+    def _targets(self, steps: TimeSteps, discovers: Tensor, follows: Tensor) -> Tensor:
         """Returns the targets, float32 [steps, num_envs, n, 3]."""
-        position = steps.get(keys.POSITION)
+        position = steps.position
         wanders = (follows < 0).unsqueeze(-1)
         alone = self._wander(steps, wanders) if self.config.wander else position
-        new = (steps.get(keys.NEW_FIRE) > 0).unsqueeze(-1)
-        centre = torch.where(new, steps.get(keys.NEW_CENTRE), steps.get(keys.OLD_CENTRE))
+        new = (steps.new_fire > 0).unsqueeze(-1)
+        centre = torch.where(new, steps.new_centre, steps.old_centre)
         leader = follows.clamp(min=0).unsqueeze(-1).expand_as(position)
         target = torch.where(wanders, alone, position.gather(-2, leader))
         over_fire = torch.cat((centre, position[..., 2:]), -1)
         target = torch.where(discovers.unsqueeze(-1), over_fire, target)
         return self._jittered(steps, target) if self.config.jitter else target
 
-    def _wander(self, steps: TensorDictBase, wanders: Tensor) -> Tensor:
+    def _wander(self, steps: TimeSteps, wanders: Tensor) -> Tensor:
         """Returns the waypoints at each step, drawn again where they are reached or due."""
-        position, step, every = steps.get(keys.POSITION), steps.get(keys.STEP), self.config.redraw
+        position, step, every = steps.position, steps.step, self.config.redraw
         # At step 0, `reset` has used the first key.
         use = Use.WAYPOINT + (step == 0) * (Use.FIRST_WAYPOINT_REDRAW - Use.WAYPOINT)
-        key = counter_rng.step_key(steps.get(keys.RNG_KEY), step, use)
+        key = counter_rng.step_key(steps.rng_key, step, use)
         points = motion.random_points(key, position.shape[-2], self.low, self.high)
         due = (step % every == 0)[..., None, None] & wanders if every else wanders & False
         waypoints = []
@@ -205,17 +231,17 @@ class Consensus(CommModule):
         return torch.stack(waypoints)
 
     def _bonus(
-        self, steps: TensorDictBase, discovers: Tensor, follows: Tensor, target: Tensor
+        self, steps: TimeSteps, discovers: Tensor, follows: Tensor, target: Tensor
     ) -> Tensor | None:
         """Returns the heading term, float32 [steps, num_envs, n]; 0 for a UAV that left the box.
 
         It depends on the positions, targets and roles of the step before, which are stored.
         """
-        heading, after = self.config.heading, steps.get(keys.POSITION)
+        heading, after = self.config.heading, steps.position
         if not heading.weight and not heading.circle:
             return None
         before = self._before(self.position, after), after, self._before(self.target, target)
-        old_fire_only = discovers & (steps.get(keys.NEW_FIRE) == 0)
+        old_fire_only = discovers & (steps.new_fire == 0)
         circles = self._before(self.old_fire_only, old_fire_only)
         leaderless = self._before(self.leaderless, follows < 0)
         term = heading_reward(*before, heading)
@@ -223,7 +249,7 @@ class Consensus(CommModule):
             term = torch.where(circles, heading.circle * circling(*before), term)
         if not self.config.wander:
             term = term.masked_fill(leaderless, 0.0)
-        left = left_box(steps.get(keys.HIT_BOUNDARY), self.world.reward.exit_axes)
+        left = left_box(steps.hit_boundary, self.world.reward.exit_axes)
         return term.masked_fill(left, 0.0)
 
     @staticmethod
@@ -233,17 +259,14 @@ class Consensus(CommModule):
         kept.copy_(now[-1])
         return before
 
-    def _jittered(self, tensordict: TensorDictBase, target: Tensor) -> Tensor:
+    def _jittered(self, steps: TimeSteps, target: Tensor) -> Tensor:
         """Adds clipped noise to x and y of targets closer than 1, within the box."""
-        key = self._step_key(tensordict, Use.TARGET_JITTER)
+        key = counter_rng.step_key(steps.rng_key, steps.step, Use.TARGET_JITTER)
         noise = counter_rng.normal(key, 2 * target.shape[-2]).unflatten(-1, (-1, 2))
         noise = (self.config.jitter * noise).clamp(-1, 1)
-        near = motion.distance(tensordict.get(keys.POSITION), target) < 1
+        near = motion.distance(steps.position, target) < 1
         moved = target + torch.nn.functional.pad(noise, (0, 1)) * near[..., None]
         return moved.clamp(self.low.float(), self.high.float())
-
-    def _step_key(self, tensordict: TensorDictBase, use: int) -> Tensor:
-        return counter_rng.step_key(tensordict.get(keys.RNG_KEY), tensordict.get(keys.STEP), use)
 
     def _scaled(self, shown: Tensor) -> Tensor:
         """Returns targets, or vectors to targets, in the scale of the observation."""

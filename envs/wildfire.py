@@ -293,8 +293,7 @@ class WildfireEnv(EnvBase):
     ) -> None:
         """Calls `steer` on the action before every step, and `communicate` on time steps.
 
-        `communicate` reads time steps, [steps, num_envs], and the last of them; it returns the last
-        one, and what it has changed in all.
+        It returns the last one, and what it has changed in all, [steps, num_envs, ...].
         """
         self._steer, self._communicate = steer, communicate
 
@@ -309,9 +308,10 @@ class WildfireEnv(EnvBase):
             steered = chosen if self._steer is None else self._steer(chosen.copy())
             steps = self._snapshot(self._advance(steered.get(keys.ACTION), len(ahead)))
             parts.append(steps.select(*metrics.counted(self.config)))
-            result = steps[-1]
-            if self._communicate is not None:
-                result, changed = self._communicate(steps, result)
+            if self._communicate is None:
+                result = steps[-1]
+            else:
+                result, changed = self._communicate(steps.unbind(0))
                 parts[-1].update(changed)
         # [envs, steps], as the time steps of a rollout are
         series: Any = torch.cat(parts).transpose(0, 1).contiguous()
