@@ -186,7 +186,7 @@ def test_narrow_tables_keep_every_number(columns, monkeypatch, capsys):
 def test_validation_has_fires_and_starts_of_its_own(cache, monkeypatch):
     config, given = small("independent", "fire=paper", "evaluation.interval_episodes=3"), []
 
-    def play(config, policy, arrival, *, start_seed, block):
+    def play(config, policy, arrival, *, start_seed, block, watch):
         given.append((arrival, start_seed, block))
         return {name: [1.0] for name in metrics.NAMES}
 

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 
 from emberlink.envs import keys
+from emberlink.envs.world.sensor import search_altitude
 from emberlink.policies.gaussian import MEMORY
 from emberlink.policies.scripted.map_greedy import MapGreedy
 from emberlink.trainers.build import build_env
@@ -78,6 +79,7 @@ def test_the_teacher_reads_the_maps_of_the_uavs_alone():
 
 def test_held_actions_end_at_the_target():
     env = taught(10)
+    height = search_altitude(env.base_env.config)
     td = env.reset()
     for _ in range(3):
         action, target = td[keys.TEACHER], env.transform[1].target.clone()
@@ -85,7 +87,7 @@ def test_held_actions_end_at_the_target():
         for _ in range(10):
             td = env.step(td.set(keys.ACTION, action))["next"]
         moved = td[keys.POSITION] - start
-        wanted = torch.cat((target - start[..., :2], 4 - start[..., 2:]), -1)
+        wanted = torch.cat((target - start[..., :2], height - start[..., 2:]), -1)
         near = wanted.abs().amax(-1) <= 2  # cells flown in ten steps
         torch.testing.assert_close(moved[near], wanted[near], atol=1e-4, rtol=0)
         assert (moved[~near].abs().amax(-1) - 2).abs().max() < 1e-4
