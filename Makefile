@@ -9,7 +9,7 @@ TESTS ?= not slow and not heavy
 # slow if another process uses a core
 THREADS ?= 1
 # settings of the demo; `make demo DEMO="episodes=10 seed=1"` chooses others
-DEMO ?= episodes=7 evaluation.episodes=32
+DEMO ?= learner.chunk=25 episodes=54 evaluation.interval=54 evaluation.episodes=32
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -27,8 +27,8 @@ export PYTHONDONTWRITEBYTECODE :=
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
 
-demo: $(INSTALLED)  ## train consensus for a few minutes and evaluate it, with figures and a GIF
-	@OMP_NUM_THREADS=$(THREADS) $(BIN)/emberlink train consensus setup=tuned $(DEMO)
+demo: $(INSTALLED)  ## train a team in two minutes and evaluate it, with figures and a GIF
+	@OMP_NUM_THREADS=$(THREADS) $(BIN)/emberlink train independent setup=strong $(DEMO)
 
 # Tests of a file run in one process, since they share trainings.
 test: $(INSTALLED)  ## run the tests, without the slow ones (about 5 minutes)
