@@ -27,7 +27,7 @@ export PYTHONDONTWRITEBYTECODE :=
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
 
-demo: $(INSTALLED)  ## train a team in two minutes and evaluate it, with figures and a GIF
+demo: $(INSTALLED)  ## train a team in three minutes and evaluate it, with figures and a GIF
 	@OMP_NUM_THREADS=$(THREADS) $(BIN)/emberlink train independent setup=strong $(DEMO)
 
 # Tests of a file run in one process, since they share trainings.
