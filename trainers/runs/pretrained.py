@@ -1,26 +1,18 @@
-"""Opens the trained policies of the package (`pretrained:consensus`), and adds runs to them.
+"""Opens the trained policies of the package (`pretrained:consensus`).
 
 Each is a reduced run folder, policies/pretrained/SETUP/METHOD/sSEED, with config.yaml,
 metrics.jsonl, eval.json, and a checkpoint of the actors. SETUP is `collection`: the setup, and the
-world if it is not `paper`. Finished runs are packed with
-
-    python -m emberlink.trainers.runs.pretrained RUN... policies/pretrained
+world if it is not `paper`. docs/experiments/pack_policies.py makes them of finished runs.
 """
 
 import re
 import shutil
-import sys
-from dataclasses import replace
 from fnmatch import fnmatch
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
-from emberlink.envs.fire_files.config import COPY_FILE
 from emberlink.envs.utils.errors import UserError, naming
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.learners.base import ACTOR
-from emberlink.trainers.runs import checkpoint
 from emberlink.trainers.runs.run_folder import NEWEST, RunFolder
 
 PREFIX = "pretrained:"
@@ -102,32 +94,6 @@ def collection(config: RunConfig) -> str:
     return config.setup if config.world == "paper" else f"{config.setup}_{config.world}"
 
 
-def pack(run: RunFolder, into: Path) -> Path:
-    """Copies a finished run to the trained policies, without training states and critics."""
-    trained = run.config(device="cpu")
-    learner: Any = trained.learner
-    if (start := getattr(learner, "warm_start", "")) and not is_name(start):
-        learner = replace(learner, warm_start=f"runs/{Path(start).name}")  # no local path
-    config = replace(trained, output="runs", logger="none", device="cpu", learner=learner)
-    if len(run.metrics()) < config.episodes or not run.evaluated():
-        raise UserError(f"{run.path}: not finished, or not evaluated")
-    target = into / collection(config) / config.method / f"s{config.seed}"
-    if target.exists():
-        raise UserError(f"{target}: exists already")
-    actors = checkpoint.read_tensors(run.newest, f"{checkpoint.WEIGHTS}{ACTOR}")
-    target.mkdir(parents=True)
-    checkpoint.write(
-        target / NEWEST,
-        checkpoint.header_of(config, run.step()),
-        {f"{checkpoint.WEIGHTS}{ACTOR}{name}": value for name, value in actors.items()},
-    )
-    RunFolder(target).write_config(config)
-    for file in ("metrics.jsonl", "eval.json", COPY_FILE):
-        if (run.path / file).is_file():
-            shutil.copyfile(run.path / file, target / file)
-    return target
-
-
 def _shipped() -> Path:
     return Path(str(files("emberlink.policies"))) / "pretrained"
 
@@ -135,9 +101,3 @@ def _shipped() -> Path:
 def _order(folder: Path) -> tuple[str, str, int]:
     setup, method, seed = folder.parts[-3:]
     return setup, method, int(seed.removeprefix("s"))
-
-
-if __name__ == "__main__":
-    *runs, into = sys.argv[1:]
-    for path in runs:
-        print(pack(RunFolder(path), Path(into)))

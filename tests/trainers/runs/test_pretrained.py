@@ -1,6 +1,7 @@
 """Tests trained policies that are shipped with emberlink."""
 
 import json
+import runpy
 import shutil
 from pathlib import Path
 
@@ -30,6 +31,9 @@ FOLDERS = (
     "tuned_front/positional/s1",
 )
 
+SCRIPT = Path(__file__).parents[3] / "docs/experiments/pack_policies.py"
+pack = runpy.run_path(str(SCRIPT))["pack"]
+
 
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory) -> tuple[Path, list[Path]]:
@@ -44,7 +48,7 @@ def packed(tmp_path_factory) -> tuple[Path, list[Path]]:
         (run,) = output.iterdir()
         runs.append(run)
     for run in runs:
-        pretrained.pack(RunFolder(run), root)
+        pack(RunFolder(run), root)
     return root, runs
 
 
@@ -82,7 +86,7 @@ def test_a_packed_run_names_no_path_of_its_warm_start(packed, tmp_path):
     arguments = ["setup=tuned", *TINY, f"learner.warm_start={start}", f"output={tmp_path / 'runs'}"]
     assert main(["train", "consensus", *arguments]) == 0
     (run,) = (tmp_path / "runs").iterdir()
-    mine = RunFolder(pretrained.pack(RunFolder(run), tmp_path / "shipped"))
+    mine = RunFolder(pack(RunFolder(run), tmp_path / "shipped"))
     assert mine.config().learner.warm_start == f"runs/{start.name}"
     for file in (mine.path / "config.yaml", mine.checkpoint()):
         assert str(start.parent).encode() not in file.read_bytes()
@@ -153,14 +157,14 @@ def test_unknown_names_give_one_line_errors(name, said, shipped, capsys):
 def test_only_finished_runs_are_packed_without_overwriting(packed, tmp_path):
     root, (run, *_) = packed
     with pytest.raises(UserError, match="exists already"):
-        pretrained.pack(RunFolder(run), root)
+        pack(RunFolder(run), root)
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
     evaluation = json.loads((copy / "eval.json").read_text())
     older = {**evaluation, "step": 1}
     (copy / "eval.json").write_text(json.dumps(older))
     with pytest.raises(UserError, match="not finished"):
-        pretrained.pack(RunFolder(copy), tmp_path / "new")
+        pack(RunFolder(copy), tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
 
