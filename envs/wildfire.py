@@ -151,9 +151,8 @@ class WildfireEnv(EnvBase):
         position = torch.zeros(num_envs, config.num_uavs, 3, dtype=torch.float64)
         self.register_buffer("_position", position)
         self.register_buffer("_ahead", torch.arange(1, self.hold + 1)[:, None], persistent=False)
-        place = torch.arange(1, num_envs + 1)
-        share = num_envs * self.hold
-        first_length = (place * config.horizon + share - 1) // share * self.hold
+        length, share = torch.arange(1, num_envs + 1) * config.horizon, num_envs * self.hold
+        first_length = (length + share - 1) // share * self.hold
         self.register_buffer("_first_length", first_length, persistent=False)
 
     def _make_specs(self) -> None:
@@ -455,12 +454,6 @@ class WildfireEnv(EnvBase):
         if self.burn_out is not None:
             fire += 2 * (self.burn_out <= now)
         return fire
-
-    @property
-    def unseen_fire(self) -> Tensor:
-        """The number of burning cells that no UAV has seen while they burned, int64 [num_envs]."""
-        burning, _ = self._map.count(self._time)
-        return burning - self._map.seen_count + self._map.seen_gone
 
     @property
     def arrival_time(self) -> Tensor:
