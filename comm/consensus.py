@@ -241,14 +241,13 @@ class Consensus(CommModule):
         if not heading.weight and not heading.circle:
             return None
         before = self._before(self.position, after), after, self._before(self.target, target)
-        old_fire_only = discovers & (steps.new_fire == 0)
-        circles = self._before(self.old_fire_only, old_fire_only)
-        leaderless = self._before(self.leaderless, follows < 0)
         term = heading_reward(*before, heading)
         if heading.circle:
+            old_fire_only = discovers & (steps.new_fire == 0)
+            circles = self._before(self.old_fire_only, old_fire_only)
             term = torch.where(circles, heading.circle * circling(*before), term)
         if not self.config.wander:
-            term = term.masked_fill(leaderless, 0.0)
+            term = term.masked_fill(self._before(self.leaderless, follows < 0), 0.0)
         left = left_box(steps.hit_boundary, self.world.reward.exit_axes)
         return term.masked_fill(left, 0.0)
 

@@ -20,7 +20,9 @@ def user_path(path: os.PathLike[str] | str) -> Path:
     try:
         return Path(path).expanduser()
     except RuntimeError:
-        raise UserError(f"{shown(path)}: there is no such home folder") from None
+        raise UserError(
+            f"{shown(path)}: there is no such home folder; the variable HOME names yours"
+        ) from None
 
 
 def open_regular(path: Path, max_bytes: int) -> BinaryIO:

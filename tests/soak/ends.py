@@ -1,5 +1,7 @@
 """Ends trainings by a signal or a full disk."""
 
+import errno
+import os
 import random
 import resource
 import shutil
@@ -101,7 +103,8 @@ def full_disk_trial(folder: Path, draw: random.Random, *, mount: bool = False) -
         (path,) = output.iterdir()
         run = RunFolder(path)
         (error,) = [line for line in text.splitlines() if line.startswith("emberlink train:")]
-        if status != 2 or "Traceback" in text:
+        why = os.strerror(errno.ENOSPC if mount else errno.EFBIG)
+        if status != 2 or why not in error or "Traceback" in text:
             failures.append(f"{status}: {text}")
         good = str(run.newest) if run.newest.exists() else "there is no checkpoint"
         if good not in error or f"emberlink train resume={path}" not in error:

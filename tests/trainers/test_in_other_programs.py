@@ -57,7 +57,7 @@ def test_an_account_without_a_home_folder_is_one_line(monkeypatch, capsys):
     for name in ("HOME", "XDG_CACHE_HOME", "EMBERLINK_CACHE"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(pwd, "getpwuid", {}.__getitem__)
-    refused(["train", "independent", *TINY], capsys, "~/.cache")
+    refused(["train", "independent", *TINY], capsys, "HOME")
 
 
 @pytest.mark.parametrize("pattern", ["%A_%a", "100%"])
