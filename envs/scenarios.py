@@ -94,7 +94,7 @@ class Generated(FireSource):
         return self._bank("test", count, grid, horizon)
 
     def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
-        seeds = fire_seeds("test", index + 1)[index:]
+        seeds = fire_seeds("test", index + 1, self.config.test_seed)[index:]
         return self._with_burn_time(make_fires(self.config, seeds, grid, horizon))
 
     def _bank(self, split: Split, count: int, grid: Grid, horizon: int) -> Tensor:
@@ -112,7 +112,8 @@ class Generated(FireSource):
             for field in dataclasses.fields(self.config)
             if getattr(self.config, field.name) != field.default
         }
-        return {"fire_seeds": fire_seeds("test", count).tolist(), "scenario": values}
+        seeds = fire_seeds("test", count, self.config.test_seed)
+        return {"fire_seeds": seeds.tolist(), "scenario": values}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -59,7 +59,7 @@ def fire_bank(
     Returns:
         As `make_fires`, on the CPU, so that every device trains on the same fires.
     """
-    seeds = fire_seeds(split, count)
+    seeds = fire_seeds(split, count, config.test_seed)
     file = cache_folder() / f"fire-{bank_key(config, split, count, grid, horizon)}.npy"
     times = (2,) if isinstance(config, ReactionConfig) else ()
     with contextlib.suppress(Exception):  # a damaged header raises many types

@@ -21,11 +21,14 @@ from torch import Tensor
 from emberlink.envs.config import BASE_SIDE, check_grid
 from emberlink.envs.fire.level_set import MAX_LENGTH_TO_BREADTH, arrival_times, disc
 from emberlink.envs.fire.ranges import (
+    TEST_FROM,
+    VALIDATION_FROM,
     Degrees,
     Fraction,
     Length,
     Ordered,
     Pair,
+    TestSeed,
     Turn,
     unit_draws,
 )
@@ -34,8 +37,6 @@ from emberlink.envs.utils.config_files import find, known, read
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, describe
 
-TEST_FROM = 1_000_000
-VALIDATION_FROM = 2_000_000
 Split = Literal["train", "validation", "test"]
 
 _MIN_NODES = 60  # along the shorter side: twice the resolution of 30 cells
@@ -106,9 +107,11 @@ class FireConfig:
     """Steps for which a cell burns; inf for ever."""
     lengths: Literal["scaled", "cells"] = "scaled"
     """Whether lengths and rates are for a 30-cell side and scaled to the grid, or in its cells."""
+    test_seed: TestSeed = TEST_FROM
+    """Seed of the first test fire."""
 
 
-_FIXED = {"name", "num_train_fires", "two_sided", "burn_time", "lengths"}
+_FIXED = {"name", "num_train_fires", "two_sided", "burn_time", "lengths", "test_seed"}
 # The position is part of a draw's key: append new fields, never reorder.
 _DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in _FIXED)
 
@@ -142,20 +145,21 @@ def load_scenario(name: str) -> GeneratedConfig:
         raise UserError(f"{find('fire', name)}: {describe(error)}") from None
 
 
-def fire_seeds(split: Split, count: int) -> Tensor:
+def fire_seeds(split: Split, count: int, test_seed: int = TEST_FROM) -> Tensor:
     """Returns the seeds of the first `count` fires of a split, int64 [count].
 
     Training seeds are 0 to 999,999, test seeds 1,000,000 to 1,999,999 and validation seeds
-    2,000,000 to 2,999,999, so the three sets are disjoint.
+    2,000,000 to 2,999,999, so the three sets are disjoint. The first test seed is `test_seed`.
 
     Raises:
         UserError: the split is not known, or the seeds would not lie in its interval.
     """
     if split not in get_args(Split):
         raise UserError(f"unknown split {split!r}; known: {', '.join(get_args(Split))}")
-    if not 1 <= count <= TEST_FROM:
-        raise UserError(f"expected a count of 1 to {TEST_FROM} seeds, got {count}")
-    first = {"train": 0, "test": TEST_FROM, "validation": VALIDATION_FROM}[split]
+    first = {"train": 0, "test": test_seed, "validation": VALIDATION_FROM}[split]
+    most = TEST_FROM - first % TEST_FROM
+    if not 1 <= count <= most:
+        raise UserError(f"expected a count of 1 to {most} seeds, got {count}")
     return torch.arange(first, first + count)
 
 

@@ -23,6 +23,10 @@ Turn = Annotated[float, Field(ge=-3600, le=3600)]
 Length = Annotated[float, Field(gt=0, le=30)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
+TEST_FROM = 1_000_000
+VALIDATION_FROM = 2_000_000
+TestSeed = Annotated[int, Field(ge=TEST_FROM, lt=VALIDATION_FROM)]
+
 
 def unit_draws(seeds: Tensor, field: int, count: int) -> Tensor:
     """Returns uniform draws on (0, 1) for a field of a scenario, float32 [fires, count].

@@ -26,11 +26,13 @@ from torch.nn.functional import pad
 
 from emberlink.envs.config import BASE_SIDE
 from emberlink.envs.fire.ranges import (
+    TEST_FROM,
     Degrees,
     Fraction,
     Length,
     Ordered,
     Pair,
+    TestSeed,
     Turn,
     unit_draws,
 )
@@ -99,6 +101,8 @@ class ReactionConfig:
     """Radius of the initial disc, cells."""
     ring_width: Annotated[tuple[Length, Length], Pair, Ordered]
     """Width of the part of the disc that burns at step 0, cells; the rest is burnt out."""
+    test_seed: TestSeed = TEST_FROM
+    """Seed of the first test fire."""
 
     @property
     def thickness(self) -> float:

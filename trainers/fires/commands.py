@@ -94,7 +94,7 @@ def make(
         name = free_name(Path(), f"{scenario}_{split}_{count}", [".npy", ".json"])
         output = name.with_name(f"{name.name}.npy")
     check_bank(output, count, config.env.grid)
-    seeds = fire_seeds(split, count)
+    seeds = fire_seeds(split, count, fire.test_seed)
     arrival, burn_out = split_times(make_fires(fire, seeds, config.env.grid, config.env.horizon))
     facts = {"scenario": scenario, "split": split, "seeds": f"{seeds[0]} to {seeds[-1]}"}
     facts |= {**_facts(config, burn_out), "generator_version": GENERATOR_VERSION}

@@ -25,7 +25,7 @@ GRID, HORIZON = (30, 30), 1000
 RANGES = [
     f.name
     for f in dataclasses.fields(FireConfig)
-    if f.name not in {"name", "num_train_fires", "two_sided", "burn_time", "lengths"}
+    if f.name not in {"name", "num_train_fires", "two_sided", "burn_time", "lengths", "test_seed"}
 ]
 
 
@@ -147,6 +147,9 @@ def test_seeds_of_splits_are_disjoint():
     assert fire_seeds("test", 2).tolist() == [TEST_FROM, TEST_FROM + 1]
     every = [fire_seeds(split, TEST_FROM) for split in get_args(Split)]
     assert len(torch.cat(every).unique()) == 3 * TEST_FROM
+    assert fire_seeds("test", 2, 1_999_998).tolist() == [1_999_998, 1_999_999]
+    with pytest.raises(ValueError, match="1 to 2 seeds"):
+        fire_seeds("test", 3, 1_999_998)
 
 
 @pytest.fixture

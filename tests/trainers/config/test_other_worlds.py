@@ -14,11 +14,13 @@ from torchrl.envs.utils import check_env_specs
 
 from emberlink import trainers
 from emberlink.envs import FileFireConfig, keys, metrics
+from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.config_files import known
 from emberlink.trainers import make_env
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import evaluated_with, flat, in_world, resolve, to_values
 from emberlink.trainers.evaluation.evaluate import scripted_config
+from emberlink.trainers.runs.pretrained import read_run
 
 ROUND = ("paper", "front", "relay", "blackout", "swarm", "paper", "relay", "front", "paper")
 
@@ -51,6 +53,21 @@ def test_a_run_of_an_earlier_edition_gets_the_rules_of_the_other_world():
     assert (moved.edition, moved.env.knowledge, moved.env.sensor) == (2, "own", (1.0, 0.1))
     assert (back.edition, back.env.grid, back.evaluation.huygens) == (1, (30, 30), True)
     assert in_world(run, "front") is run
+
+
+def test_editions_have_their_own_test_fires():
+    """Installed networks of the first edition are evaluated on its test fires."""
+    old = read_run("pretrained:strong_front/maps").config()
+    seeds = [fires_of(config.fire).describe(2)["fire_seeds"] for config in (
+        old, in_world(old, "relay"), resolve("maps", ["world=front"]), resolve("maps"),
+    )]  # fmt: skip
+    assert seeds == [[at, at + 1] for at in (1_000_000, 1_500_000, 1_500_000, 1_000_000)]
+    here, there = (fires_of(run.fire) for run in (old, in_world(old, "relay")))
+    both = [source.test(2, (60, 60), 1000) for source in (here, there)]
+    assert not both[0].equal(both[1])
+    assert both[1][1].equal(there.test_fire(1, (60, 60), 1000)[0])
+    valid = [source.validation(2, (60, 60), 1000) for source in (here, there)]
+    assert valid[0].equal(valid[1])
 
 
 def test_a_radio_of_the_run_holds_for_the_methods_of_scripted_policies_too():
