@@ -111,6 +111,31 @@ def crossed_interval(statistic: Callable[..., Any], *samples: Values) -> Interva
     """
     if min(map(len, samples)) < 2:
         return None
+    tail = (1 - LEVEL) / 2
+    return _finite(np.quantile(_crossed(statistic, samples), [tail, 1 - tail]))
+
+
+def crossed_p(statistic: Callable[..., Any], *samples: Values) -> float | None:
+    """Returns the two-sided p-value of a statistic being 0, of the resamples of the interval."""
+    if min(map(len, samples)) < 2:
+        return None
+    resampled = _crossed(statistic, samples)
+    beyond = min((resampled <= 0).sum(), (resampled >= 0).sum())
+    return float(min(1.0, 2 * (beyond + 1) / (len(resampled) + 1)))
+
+
+def holm(values: Sequence[float]) -> list[float]:
+    """Returns p-values that are corrected for their number (Holm 1979)."""
+    p = np.asarray(values, float)
+    order = p.argsort()
+    factors = np.arange(len(p), 0, -1)
+    corrected = np.empty_like(p)
+    corrected[order] = np.maximum.accumulate(p[order] * factors).clip(max=1.0)
+    return corrected.tolist()
+
+
+def _crossed(statistic: Callable[..., Any], samples: Sequence[Values]) -> Values:
+    """Returns a statistic of resamples of seeds and fires, see `crossed_interval`."""
     generator = np.random.default_rng(BOOTSTRAP_SEED)
     fires = samples[0].shape[1]
     share = generator.multinomial(fires, [1 / fires] * fires, RESAMPLES).T / fires
@@ -118,8 +143,7 @@ def crossed_interval(statistic: Callable[..., Any], *samples: Values) -> Interva
     for sample in samples:
         seeds = generator.integers(len(sample), size=(len(sample), RESAMPLES))
         drawn.append(np.take_along_axis(sample @ share, seeds, axis=0))
-    tail = (1 - LEVEL) / 2
-    return _finite(np.quantile(statistic(*drawn, axis=0), [tail, 1 - tail]))
+    return statistic(*drawn, axis=0)
 
 
 def _finite(ends: Any) -> Any:

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from emberlink.envs import metrics
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.reading import RADIO, Run
 from emberlink.trainers.comparison.tables import WARM_START, Frame, radio_text, trained_with
@@ -29,7 +30,8 @@ COLUMNS = (
 """columns of `communication_values`. `radios` is "evaluated" if the same networks were evaluated
 with other radios, "retrained" if other networks were trained with them, "scripted" for a scripted
 policy. `none`, `with_radio` and `full` are means with the radio off, with the world's radio and
-without limits; `gain` is with_radio - none, `value` is gain / (full - none)."""
+without limits; `gain` is with_radio - none, `value` is gain / (full - none), missing where the
+interval of full - none is not above 0 (below, if less is better)."""
 
 Values = NDArray[np.float64]
 Group = list[Run]
@@ -46,7 +48,7 @@ def communication_values(runs: Frame) -> Frame:
     rows = [
         {"section": runs["section"].iloc[0], "fires": fires}
         | {"label": label, "measure": measure, "radios": how}
-        | _row(samples, how == "retrained")
+        | _row(measure, samples, how == "retrained")
         for fires in runs["object"].iloc[0].evaluation.results
         for found in (_of_networks(groups, fires), _of_scripted(groups, fires))
         for label, measure, how, samples in found
@@ -123,7 +125,7 @@ def _world(run: Run) -> dict[str, Any]:
     return {k: v for k, v in run.now.items() if k.startswith("env.") and not k.startswith(left_out)}
 
 
-def _row(samples: Sequence[Values], retrained: bool) -> dict[str, Any]:
+def _row(measure: str, samples: Sequence[Values], retrained: bool) -> dict[str, Any]:
     """Returns the numbers of samples [seeds, fires]: radio off, the world's and maybe no limits."""
     means = [sample.mean(0) for sample in samples]
 
@@ -139,14 +141,21 @@ def _row(samples: Sequence[Values], retrained: bool) -> dict[str, Any]:
     row["gain_low"], row["gain_high"] = ends(_gain, 2)
     for full in rest:
         row["full"] = full
-        row["value"] = None if full == none else (with_radio - none) / (full - none)
-        row["value_low"], row["value_high"] = ends(_share, 3)
+        low, high = ends(_most, 3)
+        if low is not None and (low > 0 if measure in metrics.HIGHER_IS_BETTER else high < 0):
+            row["value"] = (with_radio - none) / (full - none)
+            row["value_low"], row["value_high"] = ends(_share, 3)
     return row
 
 
 def _gain(none: Values, with_radio: Values, axis: int = -1) -> Any:
     """Returns with_radio - none of the means along an axis."""
     return with_radio.mean(axis) - none.mean(axis)
+
+
+def _most(none: Values, with_radio: Values, full: Values, axis: int = -1) -> Any:
+    """Returns full - none of the means along an axis, what a radio without limits gains."""
+    return _gain(none, full, axis)
 
 
 def _share(none: Values, with_radio: Values, full: Values, axis: int = -1) -> Any:

@@ -22,10 +22,12 @@ from emberlink.trainers.runs.compact_json import finite
 
 
 class Difference(NamedTuple):
-    """How far one interquartile mean is above another, and the interval over seeds and fires."""
+    """How far one interquartile mean is above another, over seeds and fires."""
 
     value: float
     interval: Interval | None
+    p: float | None
+    """two-sided p-value, None with one seed; `bootstrap.holm` corrects several"""
 
 
 @dataclass(frozen=True, repr=False)
@@ -95,8 +97,11 @@ class Comparison:
             raise UserError(f"{first!r} and {second!r} are evaluations of the same runs")
         iqms = [float(bootstrap.iqm(part["value"].to_numpy(float))) for part in parts]
         samples = [np.array(part["values"].tolist(), float) for part in parts]
-        ends = bootstrap.crossed_interval(bootstrap.iqm_difference, *samples)
-        return Difference(iqms[0] - iqms[1], ends)
+        ends, p = (
+            statistic(bootstrap.iqm_difference, *samples)
+            for statistic in (bootstrap.crossed_interval, bootstrap.crossed_p)
+        )
+        return Difference(iqms[0] - iqms[1], ends, p)
 
     def to_values(self) -> dict[str, Any]:
         """Returns all results as plain values, the content of compare.json."""

@@ -28,7 +28,7 @@ Settings = Annotated[dict[str, Any], AfterValidator(infinite)]
 RADIO = "env.radio.range", "env.radio.loss", "env.radio.bandwidth"
 _TYPES: dict[str, Any] = {
     **dict.fromkeys(("method", "setup", "world", "fire.name"), str),
-    **dict.fromkeys(("seed", "episodes", "num_envs", "env.horizon"), int),
+    **dict.fromkeys(("seed", "edition", "episodes", "num_envs", "env.horizon"), int),
     **dict.fromkeys(RADIO, int | float | None),
     "evaluation.headline": str | None,
 }
@@ -133,7 +133,7 @@ def find(path: Path | str) -> list[Path]:
 def read(path: Path) -> Run:
     """Returns a run; a UserError if it is not finished or not evaluated, or a file is damaged."""
     folder = RunFolder(path)
-    settings = {"world": "paper", **flat(folder.values())}
+    settings = {"world": "paper", "edition": 1, **flat(folder.values())}
     _check_types(settings, path / "config.yaml")
     lines = _curves(folder, settings["episodes"])
     again = f"emberlink eval {shlex.quote(str(path))}"

@@ -44,8 +44,9 @@ RANKED = (
 )
 GAINED = (
     "Gain: with the world's radio less with the radio off. Value: gain / (without limits less "
-    "off), 0 where the radio adds nothing and 1 where it adds as much as one without limits. 95 % "
-    "intervals: over the fires for the same networks, over seeds and fires for retrained ones."
+    "off), 0 where the radio adds nothing and 1 where it adds as much as one without limits; "
+    "undetermined where the interval of the divisor is not above 0. 95 % intervals: over the fires "
+    "for the same networks, over seeds and fires for retrained ones."
 )
 CLAIMED = (
     "Ratio: interquartile mean against that of the best other method, above 1 where the method is "
@@ -119,8 +120,12 @@ def _gained(row: Mapping[str, Any]) -> dict[str, str]:
         "with radio": _number(row["with_radio"], digits),
         "no limits": _number(row["full"], digits),
         "gain": _with_ends(row, "gain", digits + 1),
-        "value": _with_ends(row, "value", 2),
+        "value": _with_ends(row, "value", 2) if pd.notna(row["value"]) else _undetermined(row),
     }
+
+
+def _undetermined(row: Mapping[str, Any]) -> str:
+    return "undetermined" if pd.notna(row["full"]) else NONE
 
 
 def _claimed(row: Mapping[str, Any]) -> dict[str, str]:

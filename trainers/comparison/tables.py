@@ -1,7 +1,8 @@
 """Puts runs into tables: one row per run, one per mean, one per fire and measure.
 
-A *section* holds runs that can be compared: one setup, world, training fire, horizon, grid and set
-of held-out fires. A *row* of a ranking is a label: trainings that differ in the seed alone.
+A *section* holds runs that can be compared: one setup, world and its edition, training fire,
+horizon, grid and set of held-out fires. A *row* of a ranking is a label: trainings that differ in
+the seed alone.
 """
 
 import json
@@ -25,7 +26,7 @@ NOT_COMPARED = (
 WARM_START = "learner.warm_start"
 _FIRST = ("learner.name", "policy.memory")
 """keys that name a group before all others, which often follow from them"""
-_OF_SECTION = ("setup", "world", "env.horizon", "env.grid", "fires", "start_seed")
+_OF_SECTION = ("setup", "world", "edition", "env.horizon", "env.grid", "fires", "start_seed")
 
 Frame = Any
 """a pandas table; the types that pandas infers for its parts are too wide to be checked"""

@@ -8,6 +8,7 @@ from synthetic_runs import read_evaluation, write_run
 
 from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.trainers.comparison.comparison import compare_runs
+from emberlink.trainers.comparison.report import tables
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.evaluate import evaluation_fires, play_blocks
 
@@ -61,10 +62,20 @@ def test_networks_trained_with_other_radios(tmp_path):
     one_seed = [tmp_path / f"run{override}0".replace("=", "_") for override in ("", OFF, FULL)]
     (row,) = values(*one_seed)
     assert (row["value"], interval(row, "gain"), interval(row, "value")) == (
-        0.5,
+        None,  # undetermined: another seed may have nothing to gain
         (None, None),
         (None, None),
     )
+
+
+def test_a_value_is_undetermined_where_no_limits_may_gain_nothing(tmp_path):
+    run = write_run(tmp_path, learned={"coverage": [60.0, 60, 60, 60]})
+    evaluate_otherwise(run, 0.0, [50.0, 50, 50, 50])
+    evaluate_otherwise(run, float("inf"), [40.0, 80, 80, 45])
+    (row,) = values(tmp_path)
+    assert (row["full"], row["value"], interval(row, "value")) == (61.25, None, (None, None))
+    (table,) = (t for t in tables(compare_runs([tmp_path]), row["section"]) if "gain" in t.title)
+    assert table.rows["value"].tolist() == ["undetermined"]
 
 
 def test_scripted_policies_have_a_value_for_each_radio(tmp_path):

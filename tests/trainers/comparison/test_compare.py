@@ -16,7 +16,7 @@ from emberlink.envs import metrics
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
 from emberlink.trainers.comparison import claims
-from emberlink.trainers.comparison.bootstrap import crossed_interval, iqm_difference
+from emberlink.trainers.comparison.bootstrap import crossed_interval, crossed_p, iqm_difference
 from emberlink.trainers.comparison.comparison import compare_runs
 
 LOST = "consensus, evaluated with env.radio.loss=0.5"
@@ -146,6 +146,17 @@ def test_setups_fires_and_evaluations_have_separate_sections(tmp_path):
     }
 
 
+def test_editions_of_a_world_have_separate_sections(tmp_path):
+    first = write_run(tmp_path, seed=0, overrides=("world=front", "edition=1"))
+    write_run(tmp_path, seed=1, overrides=("world=front",))
+    config = first / "config.yaml"
+    config.write_text(config.read_text().replace("edition: 1\n", ""))  # of a run before editions
+    name = "setup tuned, world front, trained on front"
+    assert labels(tmp_path) == {
+        f"{name} (edition={edition})": {"consensus": [edition - 1]} for edition in (1, 2)
+    }
+
+
 def test_labels_name_the_settings_that_tell_runs_apart(tmp_path):
     changes = ("comm.agree=false", "env.radio.range=inf", "comm.follow=nearest", "seed=0")
     for seed, setting in enumerate(changes):
@@ -255,12 +266,13 @@ def test_different_rewards_are_not_ranked(tmp_path):
 
 
 def test_difference_by_hand(comparison):
-    value, ends = comparison.difference("consensus", "independent", "coverage")
+    value, ends, p = comparison.difference("consensus", "independent", "coverage")
     first = np.array([[45.0, 55, 45, 55], [65, 75, 65, 75], [55, 65, 55, 65]])
     second = np.repeat([[40.0], [65]], 4, axis=1)
     assert value == 60 - 52.5
     assert ends == crossed_interval(iqm_difference, first, second)
-    assert comparison.difference(LOST, "positional", "coverage") == (31 - 20, None)
+    assert p == crossed_p(iqm_difference, first, second)
+    assert comparison.difference(LOST, "positional", "coverage") == (31 - 20, None, None)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ from emberlink.trainers.comparison import bootstrap as statistics
 from emberlink.trainers.comparison.bootstrap import (
     as_ratio,
     crossed_interval,
+    crossed_p,
+    holm,
     interval,
     iqm,
     iqm_difference,
@@ -127,3 +129,43 @@ def test_the_crossed_interval_draws_seeds_and_the_same_fires():
     first, second = np.repeat(fires, 2, axis=0), np.zeros((2, 3))
     assert crossed_interval(mean_difference, first, second) == (0, 20)
     assert crossed_interval(mean_difference, first[:1], second) is None
+
+
+@pytest.mark.parametrize("seeds", [5, 10])
+def test_the_crossed_interval_contains_the_truth_in_about_95_of_100_simulations(seeds, monkeypatch):
+    """Standard deviations, in points: 2 between seeds, 8 of an episode, 5 between fires.
+
+    400 simulations with 1,000 resamples gave 98 % and 97 %. An interval over fires alone, drawn for
+    both together, contains the truth in about half of them.
+    """
+    monkeypatch.setattr(statistics, "RESAMPLES", 500)
+    generator, inside, alone = np.random.default_rng(1), 0, 0
+    for _ in range(100):
+        first, second = (
+            generator.normal(0, 2, (seeds, 1)) + generator.normal(0, 5, 100)
+            + generator.normal(0, 8, (seeds, 100)) for _ in range(2)
+        )  # fmt: skip
+        low, high = crossed_interval(iqm_difference, first, second) or (0, 0)
+        inside += low <= 0 <= high
+        fires = interval(mean_difference, first.mean(0), second.mean(0), paired=True, resamples=500)
+        alone += fires[0] <= 0 <= fires[1]
+    assert 92 <= inside <= 100
+    assert alone < 90
+
+
+def test_the_p_value_belongs_to_the_interval():
+    generator = np.random.default_rng(3)
+    second = generator.normal(0, 1, (5, 8))
+    for shift in (0.0, 0.6, 1.0, 1.4, 3.0):
+        low, high = crossed_interval(iqm_difference, second + shift, second) or (0, 0)
+        p = crossed_p(iqm_difference, second + shift, second)
+        assert p is not None
+        assert (p < 0.05) == (low > 0 or high < 0)
+    assert p == pytest.approx(2 / 10_001)
+    assert crossed_p(iqm_difference, second, second[:1]) is None
+
+
+def test_holm_by_hand():
+    # 0.01 * 4, 0.02 * 3, then 0.03 * 2 and 0.04 * 1, which must not fall below it
+    assert holm([0.04, 0.01, 0.03, 0.02]) == pytest.approx([0.06, 0.04, 0.06, 0.06])
+    assert holm([0.9, 0.7]) == [1.0, 1.0]
