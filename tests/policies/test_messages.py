@@ -221,6 +221,23 @@ def test_the_actor_reads_the_links():
     assert ("next", *MEMORY) in heard.keys(True, True)
 
 
+def test_a_lost_message_contributes_nothing():
+    """With all messages lost, a team flies as with the radio off; with none lost, otherwise."""
+    more = {"policy.message": "attention", "policy.memory": "none", "policy.hold": 1}
+    more |= {"num_envs": 2, "num_train_fires": 2, "seed": 0}
+    policy, flown = PolicyConfig(message="attention"), []
+    for radio in ({"env.radio.loss": 1.0}, {"env.radio.range": 0}, {}):
+        env = make_env("independent", "strong", **{**more, "env.radio.range": 90, **radio})
+        spec, start = env.observation_spec, torch.Generator().manual_seed(3)
+        net = GaussianNetwork(
+            6, keys.observation_shapes(spec), 3, (8,), policy=policy, generator=start
+        )
+        net.output.weight.data.mul_(100)
+        flown.append(env.rollout(5, GaussianActor(net, spec))[keys.POSITION])
+    assert flown[0].equal(flown[1])
+    assert not flown[0].equal(flown[2])
+
+
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_faults_change_what_a_trained_team_does(scheme):
     setup = TrainingSetup(resolve("independent", [

@@ -97,10 +97,8 @@ class Comparison:
             raise UserError(f"{first!r} and {second!r} are evaluations of the same runs")
         iqms = [float(bootstrap.iqm(part["value"].to_numpy(float))) for part in parts]
         samples = [np.array(part["values"].tolist(), float) for part in parts]
-        ends, p = (
-            statistic(bootstrap.iqm_difference, *samples)
-            for statistic in (bootstrap.crossed_interval, bootstrap.crossed_p)
-        )
+        ends = bootstrap.crossed_interval(bootstrap.iqm_difference, *samples)
+        p = bootstrap.crossed_p(bootstrap.iqm_difference, *samples)
         return Difference(iqms[0] - iqms[1], ends, p)
 
     def to_values(self) -> dict[str, Any]:

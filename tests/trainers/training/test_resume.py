@@ -111,6 +111,34 @@ def test_a_resumed_run_equals_the_uninterrupted_run(method, learner, steps, whol
     assert_same(whole(method, *more), stopped_at(steps, method, tmp_path, *more))
 
 
+# A sensor that misses cells, maps as observations, exchanged maps and messages that are learned.
+FRONT = [
+    *("world=front", "learner=mappo", "fire.num_train_fires=2", "env.radio.range=60"),
+    *("env.radio.loss=0.3", "env.map.pixels=8", "policy.hold=2", "policy.message_size=4"),
+]
+MAP = ["env.observation=map"]
+
+
+@pytest.mark.parametrize(
+    ("method", "more"),
+    [
+        ("independent", [*GRU, "policy.message=attention"]),
+        ("maps", ["policy.message=mean"]),
+        *(
+            pytest.param(*case, marks=pytest.mark.heavy)
+            for case in (
+                ("consensus", [*GRU, "policy.message=mean"]),
+                ("independent", [*MAP, "policy.message=attention"]),
+                ("independent", [*MAP, *LEARNERS["imitation"], *GRU, "policy.message=attention"]),
+            )
+        ),
+    ],
+)
+def test_messages_maps_and_the_sensor_are_resumed(method, more, whole, tmp_path):
+    more = [*FRONT, *more]
+    assert_same(whole(method, *more), stopped_at([6, 20, 34], method, tmp_path, *more))
+
+
 def test_held_actions_failures_and_evaluations_are_resumed(whole, tmp_path):
     more = *REPLAY, "policy.hold=2", "env.failures=1", "evaluation.interval=2", "checkpoint_steps=7"
     assert_same(whole("consensus", *more), stopped_at([10, 46, 60], "consensus", tmp_path, *more))
