@@ -74,7 +74,7 @@ def read_grid(path: Path) -> Tensor:
     """Returns the arrival times of an ESRI ASCII grid, as in `Run`."""
     try:
         config = FileFireConfig(path=str(path), units="minutes", unburned="none")
-        times = read_raster(path, "asc", config, Report())[0].times
+        times = read_raster(path, "asc", config, 0, Report())[0].times
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return torch.from_numpy(times[::-1].T.copy()).float()

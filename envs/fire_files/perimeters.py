@@ -1,36 +1,103 @@
 """Makes a fire of features over time: areas of each time, their union, the arrival between them."""
 
-import functools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import binary_dilation, distance_transform_edt, label
+from scipy.ndimage import binary_dilation, binary_erosion, label
+from scipy.spatial import cKDTree
 
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.files import library
-from emberlink.envs.fire_files.grid import EIGHT, Raster, Window, span
-from emberlink.envs.fire_files.plane import choose_plane
+from emberlink.envs.fire_files.grid import EIGHT, Fire, Window
+from emberlink.envs.fire_files.plane import Bounds, choose_plane
 from emberlink.envs.fire_files.report import Report, ask, counted
 from emberlink.envs.fire_files.tables import choose_features
 from emberlink.envs.fire_files.times import read_times
 from emberlink.envs.utils.errors import UserError
 
 _MAX_TIMES = 500
-_MAX_BORDER = 2000  # sample points beside the grid, to which fronts outside are drawn
-_MANY = 50  # polygons above which points are looked up in polygons, and not polygons drawn
+_MAX_POINTS = 200_000  # points into which the front of one time is cut
 _GAP = 0.01  # of a line's length: a smaller gap between its ends is closed
-_POINT = 1e-3  # of an area's width: the size of a fire that is a point
+
+
+@dataclass
+class Perimeters(Fire):
+    """A fire of perimeters, polygons for each time. A fire only grows: their union is burnt."""
+
+    areas: Sequence[np.ndarray]
+    at: np.ndarray
+    """times of the areas, ascending"""
+
+    def bounds(self, until: float | None) -> Bounds:
+        """Returns the bounds of the burnt area, linear between two times."""
+        boxes = np.array([library("shapely").total_bounds(parts) for parts in self.areas])
+        low, high = np.minimum.accumulate(boxes[:, :2]), np.maximum.accumulate(boxes[:, 2:])
+        until, edges = self.last if until is None else until, np.hstack([low, high]).T
+        x0, y0, x1, y1 = (float(np.interp(until, self.at, edge)) for edge in edges)
+        return x0, y0, x1, y1
+
+    def on(self, window: Window, until: float, report: Report) -> np.ndarray:
+        """Divides the time between two fronts by a sample's distances to both."""
+        points, begun, idle = window.samples(), 0, 0
+        burnt, times = np.zeros(points.grid, bool), np.full(points.grid, np.inf)
+        front: Any = cKDTree(np.empty((0, 2)))
+        centres = np.stack(np.meshgrid(*points.axes(), indexing="ij"), -1)
+        index = library("shapely").STRtree(library("shapely").points(centres.reshape(-1, 2)))
+        for k, parts in enumerate(self.areas):
+            after = burnt | _drawn(parts, points, index)
+            new, last = after & ~burnt, front
+            edge = _front(np.concatenate([last.data, _outline(parts, points.side)]), after, points)
+            front = cKDTree(edge, balanced_tree=False, compact_nodes=False)
+            labels: Any = label(new, EIGHT)
+            beside: Any = binary_dilation(burnt, EIGHT)
+            begun += labels[1] - len(np.unique(labels[0][new & beside]))
+            idle += k > 0 and not new.any()
+            if k > 0:
+                passed, left = (tree.query(centres[new])[0] for tree in (last, front))
+                share = passed / np.maximum(passed + left, 1e-9)
+                times[new] = self.at[k - 1] + (self.at[k] - self.at[k - 1]) * share
+            else:
+                times[new] = self.at[0]
+            burnt = after
+            if self.at[k] >= until:
+                break
+        report.facts.append(f"{counted(begun, 'place')} where it begins")
+        report.facts += [f"{idle} within the area burnt before"] if idle else []
+        return window.earliest(times)
+
+
+def _drawn(parts: np.ndarray, points: Window, index: Any) -> np.ndarray:
+    """Returns the mask of sample points in polygons, at least one per part, bool [X, Y]."""
+    shapely, inside = library("shapely"), np.zeros(points.grid, bool)
+    inside.flat[index.query(parts, predicate="intersects")[1]] = True
+    i, j, there = points.cells(*shapely.get_coordinates(shapely.point_on_surface(parts)).T)
+    inside[i[there], j[there]] = True
+    return inside
+
+
+def _outline(parts: np.ndarray, side: float) -> np.ndarray:
+    """Returns points along the edges of polygons, half a sample apart or less, [n, 2]."""
+    shapely = library("shapely")
+    apart = max(side / 2, float(shapely.length(parts).sum()) / _MAX_POINTS)
+    return shapely.get_coordinates(shapely.segmentize(shapely.boundary(parts), apart))
+
+
+def _front(edge: np.ndarray, burnt: np.ndarray, points: Window) -> np.ndarray:
+    """Returns points of some edges that don't lie within the burnt area, one in a 16th sample."""
+    inner: Any = binary_erosion(burnt, EIGHT)
+    i, j, there = points.cells(*edge.T)
+    there[there] = inner[i[there], j[there]]
+    edge = edge[~there]
+    x, y = np.floor(edge / (points.side / 4)).astype(np.int64).T
+    return edge[np.unique(x * 2**31 + y, return_index=True)[1]]
 
 
 def read_perimeters(
-    table: tuple[Any, list[str]], config: FileFireConfig, grid: Any, horizon: int, report: Report
-) -> Raster:
-    """Makes a fire of features, and of the columns whose values stand outside their attributes.
-
-    A fire only grows: the area burnt by a time is the union of the areas until then. A fire with
-    elapsed times began at 0.
-    """
+    table: tuple[Any, list[str]], config: FileFireConfig, report: Report
+) -> Perimeters:
+    """Makes a fire of features, and of the columns whose values stand outside their attributes."""
     (frame, outside), left_out = table, []
     count = len(frame)
     frame = frame[~(frame.geometry.isna() | frame.geometry.is_empty)]
@@ -61,31 +128,29 @@ def read_perimeters(
         *report.facts,
     ]
     areas, burns = [_areas(shapes[values == time]) for time in at], (float(at[0]), float(at[-1]))
-    if clock.origin is None and at[0] > 0:
+    if clock.origin is None and at[0] > 0:  # a fire with elapsed times began at 0
         if at[0] > at[-1] - at[0]:
             report.doubts.append(f"it begins at time 0 (fire.start={at[0]:g}: at the first)")
         areas, at = [_at_zero(areas, at), *areas], np.concatenate([[0.0], at])
-    _, end = span(clock, burns, float(at[0]), config, horizon)
-    boxes = np.array([library("shapely").total_bounds(parts) for parts in areas])
-    boxes = np.hstack([np.minimum.accumulate(boxes[:, :2]), np.maximum.accumulate(boxes[:, 2:])])
-    until = at[-1] if config.margin is None else end
-    x0, y0, x1, y1 = (float(np.interp(until, at, edge)) for edge in boxes.T)
-    window = Window.around((x0, y0, x1, y1), grid, config.margin or 0)
-    count = min(int(np.searchsorted(at, end)), len(at) - 1) + 1
-    points = _around(window.samples()[0], boxes[count - 1])
-    arrival = _between(areas[:count], at, points, report)
-    corner, cell = (points.x, points.y + points.grid[1] * points.side), (points.side, points.side)
-    fire = Raster(arrival.T[::-1], corner, cell, clock, window=window, began=float(at[0]))
-    fire.first, fire.last = burns
-    return fire
+    return Perimeters(clock, *burns, float(at[0]), whole=False, areas=areas, at=at)
+
+
+def _at_zero(areas: Sequence[np.ndarray], at: np.ndarray) -> np.ndarray:
+    """Returns the area burnt at 0: the first shrinks with the speed between the first two."""
+    shapely, (first, second) = library("shapely"), areas[:2]
+    grown = shapely.area(second).sum() - shapely.area(first).sum()
+    edges = (shapely.length(first).sum() + shapely.length(second).sum()) / 2
+    small = shapely.buffer(first, -max(grown, 0) / edges / (at[1] - at[0]) * at[0])
+    points = shapely.buffer(shapely.point_on_surface(first), 1e-3 * shapely.area(first) ** 0.5)
+    return shapely.get_parts(np.where(shapely.is_empty(small), points, small))
 
 
 def _on_plane(frame: Any, config: FileFireConfig, report: Report) -> Any:
     """Returns the shapes of features on a plane, with a circle for each point."""
     x0, y0, x1, y1 = (float(value) for value in frame.total_bounds)
-    plane = choose_plane(frame.crs, config.crs, (x0, y0, x1, y1), None)
+    plane = choose_plane(frame.crs, config.crs, (x0, y0, x1, y1))
     report.facts.append(plane.about)
-    shapes = frame.geometry.force_2d() if frame.has_z.any() else frame.geometry
+    shapes = frame.geometry.force_2d()
     if plane.target is not None:
         shapes = shapes.set_crs(plane.source, allow_override=True).to_crs(plane.target)
         if not np.isfinite(shapes.total_bounds).all():
@@ -109,16 +174,13 @@ def _areas(shapes: Any) -> np.ndarray:
     areas = shapes[shapes.geom_type == "Polygon"]
     lines = shapes[shapes.geom_type.isin(("LineString", "LinearRing"))]
     lines = lines[lines.is_closed | ~lines.index.isin(areas.index)]
-    if len(areas) == len(lines) == 0:
-        raise ask(f"{name} is of {shapes.geom_type.iloc[0]}", "polygons or lines")
     found = areas.to_numpy()
     if not areas.is_valid.all():
         found = shapely.make_valid(found, method="structure", keep_collapsed=False)
-    found = np.concatenate([found, _within(lines)]) if len(lines) else found
-    parts = shapely.get_parts(found)
+    parts = shapely.get_parts(np.concatenate([found, _within(lines)]) if len(lines) else found)
     parts = parts[shapely.area(parts) > 0]
     if len(parts) == 0:
-        raise ask(f"{name} encloses no area", "a perimeter")
+        raise ask(f"{name} encloses no area", "polygons or closed lines")
     return parts
 
 
@@ -135,87 +197,3 @@ def _within(lines: Any) -> np.ndarray:
         raise UserError(f"{name}: a line is not closed, {gap} is missing")
     rings = [shapely.linearrings(shapely.get_coordinates(line)) for line in merged]
     return np.array([shapely.build_area(shapely.node(shapely.geometrycollections(rings)))])
-
-
-def _around(points: Window, box: np.ndarray) -> Window:
-    """Returns sample points continued over a box, to which distances are computed."""
-    corner, size = np.array([points.x, points.y]), np.array(points.grid)
-    past = np.array([corner - box[:2], box[2:] - corner - size * points.side])
-    below, above = np.clip(np.ceil(past / points.side).astype(int) + 1, 0, _MAX_BORDER)
-    x, y = (corner - below * points.side).tolist()
-    columns, rows = (size + below + above).tolist()
-    return Window(x, y, points.side, (columns, rows))
-
-
-def _at_zero(areas: Sequence[np.ndarray], at: np.ndarray) -> np.ndarray:
-    """Returns the area burnt at time 0, by extrapolating the boxes of the first two perimeters."""
-    shapely = library("shapely")
-    first, second = (np.array(shapely.total_bounds(parts)) for parts in areas[:2])
-    grown = np.concatenate([np.minimum(second - first, 0)[:2], np.maximum(second - first, 0)[2:]])
-    speed = grown / (at[1] - at[0])
-    width, spread = ((box[2:] - box[:2]).sum() for box in (first, speed))
-    moved = speed * (min(at[0], width / spread) if spread > 0 else 0.0)  # then it is a point
-    then = []
-    for part in areas[0]:
-        now = np.array(part.bounds)
-        size, box = now[2:] - now[:2], now - moved
-        scale = np.maximum((box[2:] - box[:2]) / size, _POINT)
-        shift = np.clip((box[:2] + box[2:]) / 2, now[:2], now[2:]) - scale * (now[:2] + size / 2)
-        small = shapely.transform(part, lambda xy, k=scale, d=shift: xy * k + d).intersection(part)
-        point = part.representative_point().buffer(_POINT * size.min())
-        then += [part for part in shapely.get_parts(small) if part.area > 0] or [point]
-    return np.array(then)
-
-
-def _between(
-    areas: Sequence[np.ndarray], at: np.ndarray, window: Window, report: Report
-) -> np.ndarray:
-    """Returns arrival times at the centres of a window's cells, by the distances to fronts."""
-    before = _rasterize(areas[0], window)
-    begun, idle = int(label(before, EIGHT)[1]), 0  # pyright: ignore
-    times = np.where(before, at[0], np.inf)
-    for k in range(1, len(areas)):
-        after = before | _rasterize(areas[k], window)
-        new = after & ~before
-        parts: Any = label(new, EIGHT)
-        beside: Any = binary_dilation(before, EIGHT)
-        begun += parts[1] - len(np.unique(parts[0][new & beside]))
-        idle += not new.any()
-        if before.any():
-            # Distances of centres to the edges of the areas, in cells.
-            from_last, to_next = (
-                np.asarray(distance_transform_edt(area)) - 0.5
-                for area in (~before, np.pad(after, 1))
-            )
-            share = from_last / (from_last + to_next[1:-1, 1:-1])
-            times[new] = (at[k - 1] + (at[k] - at[k - 1]) * share)[new]
-        else:
-            times[new] = at[k]  # the first front lies outside
-        before = after
-    report.facts.append(f"{counted(begun, 'place')} where it begins")
-    report.facts += [f"{idle} within the area burnt before"] if idle else []
-    return times
-
-
-@functools.lru_cache(1)
-def _tree(window: Window) -> Any:
-    """Returns a tree of the centres of a window's cells, in C order."""
-    shapely, centres = library("shapely"), np.meshgrid(*window.axes(), indexing="ij")
-    return shapely.STRtree(shapely.points(*(at.ravel() for at in centres)))
-
-
-def _rasterize(parts: np.ndarray, window: Window) -> np.ndarray:
-    """Returns the mask of cells centred in polygons, at least one per part, bool [X, Y]."""
-    shapely = library("shapely")
-    if len(parts) > _MANY:
-        inside = np.zeros(window.grid, bool)
-        inside.flat[_tree(window).query(parts, predicate="intersects")[1]] = True
-    else:
-        affine = library("rasterio.transform").from_origin(
-            window.x, window.y + window.grid[1] * window.side, window.side, window.side
-        )
-        about = {"out_shape": window.grid[::-1], "transform": affine, "dtype": "uint8"}
-        inside = library("rasterio.features").rasterize(parts, **about)[::-1].T.astype(bool)
-    i, j, there = window.cells(*shapely.get_coordinates(shapely.point_on_surface(parts)).T)
-    inside[i[there], j[there]] = True
-    return inside

@@ -3,15 +3,11 @@
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from emberlink.envs.fire_files.files import library
 from emberlink.envs.fire_files.report import ask
 
 Bounds = tuple[float, float, float, float]
 """Minimum x, minimum y, maximum x, maximum y."""
-MAX_CELLS = 50_000_000
-"""Cells of a raster, which is read as a whole."""
 _BENT = 1.1  # ratio of a projection's axes above which a file is projected to another plane
 _MAX_DEGREES = 20.0  # across; a UTM zone is no plane for more
 
@@ -29,27 +25,28 @@ class Plane(NamedTuple):
         axes = getattr(self.target or self.source, "axis_info", None)
         return axes[0].unit_conversion_factor if axes else None
 
+    def project(self, x: Any, y: Any, *, back: bool = False) -> tuple[Any, Any]:
+        """Returns coordinates of the file on the plane, or those of the plane in the file."""
+        if self.target is None:
+            return x, y
+        ends = (self.target, self.source) if back else (self.source, self.target)
+        return library("pyproj").Transformer.from_crs(*ends, always_xy=True).transform(x, y)
 
-def choose_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | None) -> Plane:
+
+def choose_plane(crs: Any, wanted: str | None, bounds: Bounds) -> Plane:
     """Chooses the plane for the coordinates of a file; a projection that bends is replaced.
 
-    `wanted` is `fire.crs`: the projection of a file without one, otherwise the target. `cell` is
-    the side of a raster's cells; None for perimeters.
+    `wanted` is `fire.crs`: the projection of a file without one, otherwise the target.
     """
     size = max(bounds[2] - bounds[0], bounds[3] - bounds[1])
     where = f"coordinates from {bounds[:2]} to {bounds[2:]}"
-    if not max(map(abs, bounds)) <= 1e9:
-        raise ask(f"{where} are not on the Earth", "metres or degrees")
     in_degrees = max(map(abs, bounds[::2])) <= 360 and max(map(abs, bounds[1::2])) <= 90.01
     if crs is None and wanted is None:
-        # Cells of 0.1 degrees would be 11 km wide, a fire of 5 degrees 500 km.
-        if in_degrees and (size < 5 if cell is None else cell < 0.1):
+        if in_degrees and size < 5:
             seen = f"{where} may be degrees, and no projection is given"
             raise ask(seen, "fire.crs, such as fire.crs=EPSG:4326 for longitude and latitude")
         return Plane("no projection in the file: its coordinates are taken as a plane")
     source = parse_crs(crs or wanted)
-    if crs and wanted and not (source.is_projected or source.is_geographic):
-        source, crs = parse_crs(wanted), None  # a local plane that the user knows
     if source.is_geographic and not (in_degrees and size <= _MAX_DEGREES):
         seen = f"{where} are not the degrees of {source.name}, or too far apart for one UTM zone"
         raise ask(seen, "another fire.crs", "a file of the fire alone")
@@ -96,26 +93,3 @@ def _shape(crs: Any, source: Any, bounds: Bounds) -> tuple[str, float]:
     ratio = float(factors.tissot_semimajor / factors.tissot_semiminor)
     turn = round(factors.meridian_convergence)
     return f"axes {ratio:.2f} : 1, north turned by {turn} degrees", ratio
-
-
-def warped(times: np.ndarray, affine: Any, plane: Plane) -> tuple[np.ndarray, Any]:
-    """Projects times and rotates the raster north up, on cells of half the size.
-
-    Times are interpolated between burnt cells. A point in a cell that never burns stays inf.
-    """
-    warp, methods = library("rasterio.warp"), library("rasterio").enums.Resampling
-    source = plane.source if plane.target else "EPSG:3857"  # any plane: only rotated
-    target, (rows, columns) = plane.target or source, times.shape
-    corners = [affine * at for at in ((0, 0), (columns, 0), (0, rows), (columns, rows))]
-    box = *map(min, *corners), *map(max, *corners)
-    to, width, height = warp.calculate_default_transform(source, target, columns, rows, *box)
-    if 4 * width * height > MAX_CELLS:
-        raise ask(f"{2 * width} x {2 * height} cells on a plane", f"at most {MAX_CELLS}")
-    to @= affine.scale(0.5)
-    about = {"src_transform": affine, "src_crs": source, "src_nodata": np.nan}
-    about |= {"dst_transform": to, "dst_crs": target, "dst_nodata": np.nan}
-    inside, between = np.full((2, 2 * height, 2 * width), np.nan)
-    values = np.where(np.isfinite(times), times, np.nan)
-    warp.reproject(values, inside, resampling=methods.nearest, **about)
-    warp.reproject(values, between, resampling=methods.bilinear, **about)
-    return np.where(np.isnan(inside) | np.isnan(between), np.inf, between), to

@@ -3,25 +3,25 @@
 import itertools
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import binary_erosion
+from scipy.ndimage import binary_erosion, label, map_coordinates, minimum_filter, minimum_filter1d
 
 from emberlink.envs.config import SIDES
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.files import check_prj, first_line, forest_grids, library
-from emberlink.envs.fire_files.grid import Raster, beginnings
-from emberlink.envs.fire_files.plane import MAX_CELLS, Plane, choose_plane, warped
+from emberlink.envs.fire_files.grid import EIGHT, Fire, Window
+from emberlink.envs.fire_files.plane import Bounds, Plane, choose_plane
 from emberlink.envs.fire_files.report import Clock, Report, ask, counted
 from emberlink.envs.fire_files.times import decided_unit, in_order, in_utc, parse_dates
 from emberlink.envs.utils.errors import UserError
 
-Place = tuple[tuple[float, ...], Any]
-"""(a, b, c, d, e, f), and a projection or None: x = a column + b row + c, y = d column + ..."""
+_MAX_CELLS = 50_000_000
 MAX_BANK = 300_000_000
 """Maximum number of cells of all fires of a bank: 1.2 GB."""
 _DRIVERS = {"tif": "GTiff", "nc": "netCDF", "asc": "AAIGrid"}
@@ -43,33 +43,114 @@ _NEVER = (-9999.0, -1.0)  # NODATA of FARSITE and FlamMap, and of ELMFIRE
 _VOID = 1e30  # a number beyond it is NODATA although not declared, such as -3.4e38
 
 
-def read_raster(path: Path, kind: str, config: FileFireConfig, report: Report) -> list[Raster]:
+@dataclass
+class Raster(Fire):
+    """A fire of arrival times in cells, [rows, columns], inf for never."""
+
+    times: np.ndarray
+    affine: tuple[float, ...]
+    """(a, b, c, d, e, f): x = a column + b row + c, y = d column + e row + f"""
+    plane: Plane
+
+    def bounds(self, until: float | None) -> Bounds:
+        """Returns the bounds of the raster, or of the area burnt by a time, up to the front."""
+        if until is None:
+            at = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * self.times.shape
+            x, y = self._places(*at.T)
+        else:
+            burnt = self.times <= until
+            if burnt.sum() < 2:
+                raise UserError(f"until {self.clock.format(until)} no fire spreads: a single cell")
+            inner: Any = binary_erosion(burnt)
+            rows, columns = np.nonzero(burnt & ~inner)
+            at, left = np.array([rows, columns]), until - self.times[rows, columns]
+            # Along each axis, the front has passed the centre by less than a cell.
+            before = [minimum_filter1d(self.times, 3, axis)[rows, columns] for axis in (0, 1)]
+            passed = self.times[rows, columns] - before
+            reach = np.where(left < passed, left / np.where(passed > 0, passed, 1), 0.5)
+            x, y = self._places(*np.concatenate([at + 0.5 - reach, at + 0.5 + reach], 1))
+        return float(x.min()), float(y.min()), float(x.max()), float(y.max())
+
+    def on(self, window: Window, until: float, report: Report) -> np.ndarray:
+        """Interpolates bilinearly between burnt cells; the first cells of a fire are never lost.
+
+        A map of the whole grid, and a raster with the grid's cells, are not interpolated.
+        """
+        rows, columns = self._cells(window)
+        size = math.hypot(rows[1, 1] - rows[0, 0], columns[1, 1] - columns[0, 0]) / math.sqrt(2)
+        apart = max(np.abs(at - np.rint(at)).max() for at in (rows, columns))
+        points = window if apart < 1e-3 and abs(size - 1) < 1e-6 else window.samples()
+        rows, columns = self._cells(points)
+        ends = zip((rows, columns), self.times.shape, strict=True)
+        near = [np.clip(np.rint(at).astype(np.int64) + 1, 0, end + 1) for at, end in ends]
+        times = np.pad(self.times, 1, constant_values=np.inf)[*near]
+        if not self.whole:
+            burns = np.isfinite(self.times)
+            weights, total = (
+                map_coordinates(values, (rows, columns), order=1, mode="nearest")
+                for values in (burns.astype(np.float64), np.where(burns, self.times, 0.0))
+            )
+            between = np.maximum(total / np.where(weights > 0, weights, 1), self.first)
+            times = np.where(np.isinf(times) | (weights == 0), np.inf, between)
+        earliest = window.earliest(times)
+        # Points that are farther apart than the cells miss some of these.
+        missed = size * points.side / window.side > 1 + 1e-6
+        first = np.isfinite(self.times) & (missed | (self.times == minimum_filter(self.times, 3)))
+        rows, columns = np.nonzero(first)
+        i, j, there = window.cells(*self._places(rows + 0.5, columns + 0.5))
+        np.minimum.at(earliest, (i[there], j[there]), self.times[rows[there], columns[there]])
+        return earliest
+
+    def _places(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns x and y on the plane of fractional rows and columns."""
+        a, b, c, d, e, f = self.affine
+        return self.plane.project(a * columns + b * rows + c, d * columns + e * rows + f)
+
+    def _cells(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the rows and columns, 0 at the first centre, of a window's centres, [X, Y]."""
+        (a, b, c, d, e, f), area = self.affine, _area(self.affine)
+        x, y = self.plane.project(*np.meshgrid(*window.axes(), indexing="ij"), back=True)
+        found = (a * (y - f) - d * (x - c)) / area - 0.5, (e * (x - c) - b * (y - f)) / area - 0.5
+        rows, columns = (np.nan_to_num(at, nan=-9, posinf=-9, neginf=-9) for at in found)
+        return rows, columns
+
+
+def _area(affine: tuple[float, ...]) -> float:
+    return affine[0] * affine[4] - affine[1] * affine[3]
+
+
+def read_raster(
+    path: Path, kind: str, config: FileFireConfig, horizon: int, report: Report
+) -> list[Raster]:
     """Reads the fire of a raster, or the fires of a bank."""
     if kind == "points":
         return [_front_points(path, config, report)]
     if kind in ("npy", "grids"):
         maps = _array(path, kind)
         if config.kind == "masks":
-            return [_of_states(maps, ((*_NORTH_UP, maps.shape[1]), None), config, report)]
+            affine = (*_NORTH_UP, float(maps.shape[1]))
+            return [_of_states(maps, affine, None, config, report)]
         if kind == "grids":
             raise ask(f"{len(maps)} maps of Cell2Fire", "fire.kind=masks")
         json = path.with_suffix(".json")
         about = json.open(errors="replace").read(1_000_000) if json.is_file() else ""
-        horizon = re.search(r'"horizon": *(\d+)', about)
-        return _bank(maps.transpose(0, 2, 1)[:, ::-1], horizon and horizon[1], config, report)
+        written = re.search(r'"horizon": *(\d+)', about)
+        return _bank(
+            maps.transpose(0, 2, 1)[:, ::-1], written and written[1], config, horizon, report
+        )
     with _opened(path, kind, config.layer) as dataset:
         affine, crs, tags = tuple(dataset.transform[:6]), dataset.crs, dataset.tags()
         if dataset.transform.is_identity:
             affine = (*_NORTH_UP, float(dataset.height))
         if config.kind == "masks":
-            return [_of_states(_read(dataset, MAX_BANK), (affine, crs), config, report)]
+            return [_of_states(_read(dataset, MAX_BANK), affine, crs, config, report)]
         if tags.get("units") == "steps" and crs is None:
             bands = _read(dataset, MAX_BANK)
             bands = np.where(bands == dataset.nodata, np.inf, bands)
-            return _bank(bands, tags.get("horizon"), config, report)
+            return _bank(bands, tags.get("horizon"), config, horizon, report)
         check_prj(path, kind, crs or config.crs)
         times, clock, what = _band(path, kind, dataset, config)
-        return [_on_plane(times, (affine, crs), clock, what, config, report)]
+        return [_on_plane(times, affine, crs, clock, what, config, report)]
 
 
 @contextmanager
@@ -96,9 +177,8 @@ def _read(dataset: Any, most: int, band: int | None = None) -> np.ndarray:
     """Reads a band or all, [bands, rows, columns], of bounded size and a type of real numbers."""
     count = 1 if band else dataset.count
     size = max(count * dataset.width * dataset.height, *map(math.prod, dataset.block_shapes))
-    kind = np.dtype(dataset.dtypes[0])
-    if size > most or kind.kind not in "iuf":
-        seen = f"{count} x {dataset.height} x {dataset.width} cells of {kind}"
+    if size > most or np.dtype(dataset.dtypes[0]).kind not in "iuf":
+        seen = f"{count} x {dataset.height} x {dataset.width} cells of {dataset.dtypes[0]}"
         raise ask(f"{seen}, in blocks of {dataset.block_shapes[0]}", f"{most} real numbers at most")
     return dataset.read([band] if band else None)
 
@@ -117,13 +197,10 @@ def _band(
     what = f"band {next((title for title in titles if title), band)!r:.60}"
     what += f", the last of {band} times" if band > 1 else ""
     what += f" ({declared})" if declared else ""
-    if kind == "asc":
-        values = _numbers(path, dataset.shape)
-        nodata = values == (math.nan if dataset.nodata is None else dataset.nodata)
-    else:
-        flags = [flag.name for flag in dataset.mask_flag_enums[band - 1]]
-        nodata = None if "all_valid" in flags else dataset.read_masks(band) == 0
-        values = _read(dataset, MAX_CELLS, band)[0]
+    as_text = kind == "asc"
+    values = _numbers(path, dataset.shape) if as_text else _read(dataset, _MAX_CELLS, band)[0]
+    flags = [flag.name for flag in dataset.mask_flag_enums[band - 1]]
+    nodata = None if "all_valid" in flags else dataset.read_masks(band) == 0
     values = values * dataset.scales[band - 1] + dataset.offsets[band - 1]
     name, _, since = declared.partition(" since ")
     known = next((u for u, form in _UNITS.items() if re.fullmatch(form, name, re.IGNORECASE)), None)
@@ -131,26 +208,25 @@ def _band(
         raise ask(f"{what} is in {name[:20]}, {known}", "arrival times")
     unit = decided_unit(known, config, what)
     origin = in_utc(parse_dates([since.strip()], None, "units")[0]) if since else None
-    return arrival(values, nodata, config), Clock(unit, origin), what
+    return _arrival(values, nodata, config), Clock(unit, origin), what
 
 
 def _numbers(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     """Returns the numbers of ESRI ASCII; GDAL reads a word as 0, and wraps rows."""
     with path.open(encoding="utf-8-sig", errors="replace") as file:
-        header = len(list(itertools.takewhile(_HEADER.match, file)))
-        file.seek(0)
-        most = math.prod(shape) + 1
+        rows = itertools.dropwhile(_HEADER.match, file)
         try:
-            values = np.loadtxt(file, comments=None, ndmin=2, skiprows=header, max_rows=most)
+            values = np.loadtxt(rows, comments=None, ndmin=2, max_rows=math.prod(shape) + 1)
         except ValueError as error:
-            seen = f"after {header} lines of header: {first_line(error).split(';')[0]}"
-            raise ask(seen, f"rows of {shape[1]} numbers") from None
+            raise ask(first_line(error).split(";")[0], f"rows of {shape[1]} numbers") from None
     if values.shape != shape:
         raise ask(f"{values.shape} rows and columns", f"nrows, ncols={shape}")
     return values
 
 
-def _of_states(maps: np.ndarray, place: Place, config: FileFireConfig, report: Report) -> Raster:
+def _of_states(
+    maps: np.ndarray, affine: Any, crs: Any, config: FileFireConfig, report: Report
+) -> Raster:
     """Returns the number of the first map in which each cell is not unburnt."""
     states = np.unique(maps)
     listed = ", ".join(f"{state:g}" for state in states[:12])
@@ -159,48 +235,51 @@ def _of_states(maps: np.ndarray, place: Place, config: FileFireConfig, report: R
         raise ask(f"states {listed}", f"fire.unburned, those that are no fire, {some}")
     burns = ~np.isin(maps, (0,) if config.never is None else config.never)
     times = np.where(burns.any(0), burns.argmax(0), np.inf)
-    check_spreads(times)
+    _check_spreads(times)
     unit = config.units if config.units not in (None, "steps") else "maps"
     what = f"{len(maps)} maps of the states {listed}, rows from north to south"
-    return _on_plane(times, place, Clock(unit), what, config, report)
+    return _on_plane(times, affine, crs, Clock(unit), what, config, report)
 
 
 def _on_plane(
-    times: np.ndarray, place: Place, clock: Clock, what: str, config: FileFireConfig, report: Report
+    times: np.ndarray, affine: Any, crs: Any, clock: Clock, what: str, config: Any, report: Report
 ) -> Raster:
-    """Returns times on a plane, north up."""
+    """Returns times on the plane of a file's projection, and reports what they are."""
     if clock.unit in ("days", "day_of_year"):
         times, clock = in_order(times, config), Clock("days", clock.origin)
-    affine, crs = place
-    a, b, c, d, e, f = (float(value) for value in affine)
-    area, (rows, columns) = abs(a * e - b * d), times.shape
-    if not math.isfinite(c + f) or not 1e-20 < area < 1e12:
-        raise ask(f"cells of {a:g} x {e:g}", "a size above 0")
+    if not 1e-20 < abs(_area(affine)) < 1e12:
+        raise ask(f"cells of {affine[0]:g} x {affine[4]:g}", "a size above 0")
     plane = Plane("no place in the file: square cells, the first row in the north")
+    fire = as_fire(times, clock, affine, plane)
     if crs is not None or affine[:5] != _NORTH_UP:
-        ends = [(u, v) for u in (0, columns) for v in (0, rows)]
-        x, y = ([p * u + q * v + r for u, v in ends] for p, q, r in ((a, b, c), (d, e, f)))
-        plane = choose_plane(crs, config.crs, (min(x), min(y), max(x), max(y)), math.sqrt(area))
-    first = times.min()  # by the cells of the file
+        fire.plane = choose_plane(crs, config.crs, fire.bounds(None))
     row, column = np.unravel_index(times.argmin(), times.shape)
     around = times[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-    crossing = (around[np.isfinite(around)] - first).max()
-    if a < 0 and not (b or d):
-        times, a, c = times[:, ::-1], -a, c + columns * a
-    if e > 0 and not (b or d):
-        times, e, f = times[::-1], -e, f + rows * e
-    if plane.target or b or d:
-        north_up = library("rasterio").Affine(a, b, c, d, e, f)
-        times, (a, b, c, d, e, f, *_) = warped(times, north_up, plane)
-        check_spreads(times)
-    fire = Raster(times, (c, f), (a, -e), clock)
-    if first <= crossing and clock.origin is None and clock.unit not in ("steps", "maps"):
+    crossing = (around[np.isfinite(around)] - fire.first).max()
+    if fire.first <= crossing and clock.origin is None and clock.unit not in ("steps", "maps"):
         fire.began = 0.0  # the ignition lies between the centres of cells
     cells, begin, end = np.isfinite(times).sum(), clock.format(fire.first), clock.format(fire.last)
-    places = counted(beginnings(times), "place")
-    burn = f"{cells} cells burn from {begin} to {end}"
-    report.facts += [burn, f"{places} where it begins", what, plane.about]
+    places = f"{counted(_beginnings(times), 'place')} where it begins"
+    report.facts += [f"{cells} cells burn from {begin} to {end}", places, what, fire.plane.about]
     return fire
+
+
+def as_fire(times: np.ndarray, clock: Clock, affine: Any, plane: Plane | None = None) -> Raster:
+    """Returns a fire that begins with its first arrival; without a plane, a map of the grid."""
+    burning = times[np.isfinite(times)]
+    first, last, whole = float(burning.min()), float(burning.max()), plane is None
+    return Raster(
+        clock, first, last, first, whole, times.astype(np.float64), affine, plane or Plane("")
+    )
+
+
+def _beginnings(times: np.ndarray) -> int:
+    """Returns the number of places that burn before all cells around them."""
+    burns, earliest = np.isfinite(times), times == minimum_filter(times, 3)
+    # Of cells that burn at the same time, one may have an earlier neighbour: no beginning.
+    later = minimum_filter(np.where(burns & ~earliest, times, np.inf), 3) == times
+    places: Any = label(burns & earliest, EIGHT)
+    return int(places[1] - len(np.unique(places[0][burns & earliest & later])))
 
 
 def _array(path: Path, kind: str) -> np.ndarray:
@@ -210,18 +289,17 @@ def _array(path: Path, kind: str) -> np.ndarray:
             return np.stack([np.loadtxt(p, delimiter=",", ndmin=2) for p in forest_grids(path)])
         # Memory-mapped, so that a wrong header allocates nothing.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-        array = array[None] if array.ndim == 2 else array
-        right = array.ndim == 3 and array.dtype.kind in "iufb" and 0 < array.size <= MAX_BANK
     except Exception as error:  # a damaged header raises many types
         raise ask(first_line(error), "an array of NumPy, or maps of one size") from None
-    if not right:
+    array = array[None] if array.ndim == 2 else array
+    if array.ndim != 3 or array.dtype.kind not in "iufb" or not 0 < array.size <= MAX_BANK:
         seen = f"an array of {list(array.shape)}, {array.dtype}"
         raise ask(seen, f"[fires, X, Y] of at most {MAX_BANK} numbers")
     return array
 
 
 def _bank(
-    fires: np.ndarray, horizon: str | None, config: FileFireConfig, report: Report
+    fires: np.ndarray, written: str | None, config: FileFireConfig, horizon: int, report: Report
 ) -> list[Raster]:
     """Returns fires in steps, [fires, rows, columns] from north to south, each a whole map."""
     count, rows, columns = fires.shape
@@ -229,19 +307,24 @@ def _bank(
         raise ask(f"fires of {columns} x {rows} cells", f"{SIDES[0]} to {SIDES[1]}")
     few = np.unique(fires[:: max(1, count // 8)])
     if len(few) <= 6 and np.isfinite(few).all() and (few % 1 == 0).all():
-        listed = ", ".join(shares(fires, np.unique(fires), fires.size))
+        listed = ", ".join(f"{state:g} ({_share(fires, state)})" for state in np.unique(fires))
         seen = f"{count} maps of the states {listed}, and no inf, never"
         raise ask(seen, "arrival times of fires", "fire.kind=masks for a map of states per time")
+    if config.units not in (None, "steps") and config.test is None:  # no other file has units
+        raise ask(f"fire.units={config.units}: a bank is in steps", "none")
+    if config.start is config.end is None and written not in (None, str(horizon)):
+        stretch = f"fire.end={written} to stretch them over {horizon} steps"
+        seen = f"its fires are of {written} steps, env.horizon is {horizon}"
+        raise ask(seen, f"env.horizon={written}", stretch)
     sources = []
     for place, values in enumerate(fires):
         try:
-            times = arrival(values, None, config, in_bank=True)
-            sources.append(Raster(times, (0.0, rows), (1.0, 1.0), Clock("steps"), whole=True))
+            times = _arrival(values, None, config, in_bank=True)
         except UserError as error:
             raise UserError(f"fire {place}: {error}") from None
+        sources.append(as_fire(times, Clock("steps"), (*_NORTH_UP, float(rows))))
     about = f"a bank of {counted(count, 'fire')} of {columns} x {rows} cells, in steps"
-    report.facts.append(about + (f", written for {horizon} steps" if horizon else ""))
-    report.written = int(horizon) if horizon else None
+    report.facts.append(about + (f", written for {written} steps" if written else ""))
     return sources
 
 
@@ -255,8 +338,6 @@ def _front_points(path: Path, config: FileFireConfig, report: Report) -> Raster:
             try:
                 parts = line.strip().removesuffix(b",").split(b",")
                 points = np.array([float(part) for part in parts]).reshape(-1, 3)
-                if not (np.abs(points) < 1e9).all():
-                    raise ValueError
             except ValueError:
                 seen = f"line {count}: {line[:20]!r}"
                 raise ask(seen, "x,y,intensity, of points") from None
@@ -267,13 +348,12 @@ def _front_points(path: Path, config: FileFireConfig, report: Report) -> Raster:
     if count <= _SKIPPED:
         raise ask(f"{count} lines", f"more than {_SKIPPED}, which are skipped")
     times = times[2:-2, 2:-2]
-    check_spreads(times)
+    _check_spreads(times)
     report.facts.append(f"the paper's text of {count} lines, a line per time")
-    clock = Clock(config.units or "steps")
-    return Raster(times.T[::-1], (0.0, _SIDE), (1.0, 1.0), clock, whole=True)
+    return as_fire(times.T[::-1], Clock(config.units or "steps"), (*_NORTH_UP, float(_SIDE)))
 
 
-def arrival(
+def _arrival(
     values: np.ndarray, nodata: np.ndarray | None, config: FileFireConfig, *, in_bank: bool = False
 ) -> np.ndarray:
     """Returns arrival times, inf in cells that never burn; asks about values that may be no times.
@@ -291,24 +371,23 @@ def arrival(
     plateaus = _plateaus(times, in_bank=in_bank) if config.never is None else []
     asked = [*np.unique(wrong)[:5].tolist(), *plateaus]
     if asked:
-        cells = times.size if in_bank else max(1, np.isfinite(times).sum() + len(wrong))
-        listed = " and ".join(shares(values, asked, cells, " of the cells"))
+        told = values[np.isfinite(times) | odd & ~np.isnan(values)] if not in_bank else values
+        listed = " and ".join(f"{v:g} ({_share(told, v)} of the cells)" for v in asked)
         some = ",".join(f"{value:g}" for value in asked)
         key = f"'fire.unburned=[{some}]'" if len(asked) > 1 else f"fire.unburned={some}"
         others = times[np.isfinite(times) & ~np.isin(times, asked)]
         between = f"{others.min():g} to {others.max():g}" if len(others) else "none"
         seen = f"{listed} may stand for cells that do not burn (others: {between})"
         raise ask(seen, key, *([] if len(wrong) else ["fire.unburned=none if they burn then"]))
-    check_spreads(times, may_stand=in_bank)
+    _check_spreads(times, may_stand=in_bank)
     return times
 
 
-def shares(values: np.ndarray, asked: Iterable[float], cells: int, of: str = "") -> list[str]:
-    """Returns some values as text with their shares of the cells."""
-    return [f"{v:g} ({100 * (values == v).sum() / cells:.0f} %{of})" for v in asked]
+def _share(values: np.ndarray, value: float) -> str:
+    return f"{100 * (values == value).mean():.0f} %"
 
 
-def check_spreads(times: np.ndarray, *, may_stand: bool = False) -> None:
+def _check_spreads(times: np.ndarray, *, may_stand: bool = False) -> None:
     """Checks that cells burn, more than one and, unless they `may_stand`, one after the other."""
     burning = times[np.isfinite(times)]
     seen = ""

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ from torch import Tensor
 from emberlink.envs.config import check_grid
 from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
 from emberlink.envs.fire_files.files import TABLES, digest, find_format, quiet
-from emberlink.envs.fire_files.grid import Raster, on_grid
+from emberlink.envs.fire_files.grid import Fire, on_grid
 from emberlink.envs.fire_files.perimeters import read_perimeters
 from emberlink.envs.fire_files.rasters import MAX_BANK, read_raster
 from emberlink.envs.fire_files.report import Report, ask
@@ -23,7 +23,7 @@ from emberlink.envs.fire_files.tables import read_table
 from emberlink.envs.utils.atomic_io import open_regular, replaced, user_path
 from emberlink.envs.utils.errors import UserError, naming, printable
 
-READER_VERSION = 9  # increase it if the same file gives another grid
+READER_VERSION = 10  # increase it if the same file gives another grid
 _OF_TABLES = ("time_field", "time_format", "incident", "incident_field", "where", "radius")
 
 
@@ -39,7 +39,7 @@ def read_with_summary(
     check_grid(grid)
     fires, report = [], Report()
     with _named(config.path) as path, quiet():
-        sources = _sources(path, config, grid, horizon, report)
+        sources = _sources(path, config, horizon, report)
         for source in sources:
             try:
                 fires.append(on_grid(source, config, grid, horizon, report))
@@ -68,29 +68,17 @@ def _named(file: str) -> Iterator[Path]:
         raise UserError(printable(f"{path}: {text}")) from None
 
 
-def _sources(
-    path: Path, config: FileFireConfig, grid: tuple[int, int], horizon: int, report: Report
-) -> list[Raster]:
+def _sources(path: Path, config: FileFireConfig, horizon: int, report: Report) -> Sequence[Fire]:
     """Returns the fires in a file; only a bank has more than one."""
     kind = find_format(path)
     if kind in TABLES:
         if config.kind == "masks" or config.unburned is not None:
             raise ask("fire.kind=masks and fire.unburned are for rasters", "none")
-        table = read_table(path, kind, config)
-        return [read_perimeters(table, config, grid, horizon, report)]
+        return [read_perimeters(read_table(path, kind, config), config, report)]
     for key in _OF_TABLES:
         if getattr(config, key) is not None:
             raise ask(f"fire.{key} chooses among perimeters", "none for a raster")
-    sources, unit = read_raster(path, kind, config, report), config.units
-    if sources[0].whole and sources[0].clock.unit == "steps":
-        if unit not in (None, "steps") and config.test is None:  # no other file has units
-            raise ask(f"fire.units={unit}: a bank is in steps", "none")
-        if config.start is config.end is None and report.written not in (None, horizon):
-            steps = report.written
-            stretch = f"fire.end={steps} to stretch them over {horizon} steps"
-            seen = f"its fires are of {steps} steps, env.horizon is {horizon}"
-            raise ask(seen, f"env.horizon={steps}", stretch)
-    return sources
+    return read_raster(path, kind, config, horizon, report)
 
 
 class FireSets(NamedTuple):

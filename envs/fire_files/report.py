@@ -14,18 +14,15 @@ class Report:
 
     facts: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
-    written: int | None = None
-    """steps for which a bank was written"""
 
 
 @dataclass(frozen=True)
 class Clock:
-    """The unit of a file's times, and the calendar time of 0 where it is known."""
+    """The unit of a file's times, and the calendar time of 0, in UTC, where it is known."""
 
     unit: str
     """A unit of `SECONDS`, `steps`, or `maps` of an array of states."""
     origin: datetime | None = None
-    """In UTC."""
 
     def format(self, time: float) -> str:
         """Returns a time as text."""

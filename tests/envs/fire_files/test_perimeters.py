@@ -73,20 +73,6 @@ def test_before_the_first_perimeter_by_hand(tmp_path):
     assert (dated == 0).sum() == pytest.approx(30 * 30, abs=4 * 30)
 
 
-def test_before_the_first_perimeter_each_part_shrinks(tmp_path):
-    """The left, right and upper edges move 50 m, so that two squares of 200 m began as squares
-    of 100 m. The lower edge does not move."""
-    shapes = [
-        shapely.MultiPolygon([shapely.box(0, 0, 200, 200), shapely.box(400, 0, 600, 200)]),
-        shapely.box(-50, 0, 650, 250),
-    ]
-    write(tmp_path / "fire.gpkg", shapes, [60, 120])
-    fire = read(tmp_path / "fire.gpkg", (70, 25), 120, margin=0.0)  # cells of 10 m
-    expected = torch.zeros(70, 25, dtype=torch.bool)
-    expected[10:20, :15] = expected[50:60, :15] = True
-    assert torch.equal(fire == 0, expected)
-
-
 def test_a_small_polygon_beside_a_large_one_is_not_lost(tmp_path):
     """A spot fire of 4 m lies between samples 10 m apart."""
     spot = [shapely.box(2000, 0, 2000 + side, side) for side in (4, 8)]

@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 from rasterio.transform import from_origin
 
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.grid import Raster, Window
+from emberlink.envs.fire_files.grid import Window
+from emberlink.envs.fire_files.plane import Plane
+from emberlink.envs.fire_files.rasters import as_fire
 from emberlink.envs.fire_files.reader import read_fires
-from emberlink.envs.fire_files.report import Clock
+from emberlink.envs.fire_files.report import Clock, Report
 
 INF = math.inf
 PLAIN = {"units": "minutes", "ring_width": None, "margin": None, "unburned": "none"}
@@ -231,14 +233,11 @@ def test_no_arrival_is_lost(rows, columns, side, x, y, seed):
     times = random.uniform(0, 100, (rows, columns))
     times[random.random(times.shape) < 0.3] = INF
     times[0, 0] = 5.0
-    window = Window(x, y, side, (8, 9))
-    got, cells = (
-        Raster(times, (0, rows), (1, 1), Clock("minutes"), whole=whole).on(window)
-        for whole in (False, True)
-    )
-    assert (got >= times.min() - 1e-9).all()
-    assert (np.isinf(got) | (got <= times[times < INF].max() + 1e-9)).all()
-    for (i, j), expected in by_loops(times, window).items():
-        assert side < 1 or cells[i, j] == expected
-        assert side < 1 or got[i, j] <= expected
-        assert expected > times.min() or got[i, j] == expected
+    window, last = Window(x, y, side, (8, 9)), times[times < INF].max()
+    for plane in (Plane(""), None):  # None: a map of the whole grid
+        fire = as_fire(times, Clock("minutes"), (1, 0, 0, 0, -1, rows), plane)
+        got = fire.on(window, INF, Report())
+        assert (got >= times.min() - 1e-9).all()
+        assert (np.isinf(got) | (got <= last + 1e-9)).all()
+        for (i, j), expected in by_loops(times, window).items():
+            assert expected > times.min() or got[i, j] == expected
