@@ -1,8 +1,8 @@
 """The environment for PettingZoo: a `ParallelEnv` over `WildfireEnv`."""
 
 import dataclasses
-import inspect
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import default_config
-from emberlink.envs.utils.errors import UserError, shown, unknown
+from emberlink.envs.utils.errors import UserError, shown
 from emberlink.envs.utils.validation import describe
 from emberlink.envs.wildfire import WildfireEnv
 
@@ -45,15 +45,11 @@ def parallel_env(
         kwargs: for `WildfireEnv`, if there is no `env`.
 
     Raises:
-        UserError: another render mode, more than one environment, `env` beside other settings, or
-            an argument that `WildfireEnv` does not take.
+        UserError: another render mode, more than one environment, or `env` beside other settings.
     """
     if env is not None and (kwargs or max_cycles is not None):
         given = sorted([*kwargs, *(["max_cycles"] if max_cycles is not None else [])])
         raise UserError(f"settings cannot be given with an existing environment, got {given}")
-    _, *known = inspect.signature(WildfireEnv.__init__).parameters
-    if wrong := sorted(set(kwargs) - set(known)):
-        raise UserError(f"parallel_env: {unknown(wrong[0], known)}")
     if max_cycles is not None:
         config = kwargs.get("config") or default_config(kwargs.get("fire"))
         try:
@@ -107,11 +103,9 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         self._unplayed: int | None = None
         self.possible_agents = core.group_map[keys.AGENTS]
         self.agents: list[str] = []
-        vector, pictures = team_spaces(env, core.config)
+        vector, space = observation_space(env, core.config)
         # One space object per agent, kept: PettingZoo seeds and compares them by identity.
-        self.observation_spaces: dict[str, Space] = {
-            agent: observation_space(vector, pictures) for agent in self.possible_agents
-        }
+        self.observation_spaces = {agent: deepcopy(space) for agent in self.possible_agents}
         self.action_spaces: dict[str, Space] = {
             agent: Box(-1.0, 1.0, (3,), np.float32) for agent in self.possible_agents
         }
@@ -168,7 +162,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             actions: of the live agents; actions of agents that have left are ignored.
 
         Raises:
-            UserError: an agent is not known, an action of a live agent is missing, is no array of
+            UserError: an agent is not known, an action of a live agent is missing, does not have
                 three numbers or holds NaN.
         """
         now = self._begun("step")
@@ -322,12 +316,9 @@ def to_action(action: Any, size: int, agent: str = "the team") -> Array:
     """Returns an action as an array, float32 [size].
 
     Raises:
-        UserError: it is no array of numbers, has another shape, or holds NaN.
+        UserError: it has another shape, or holds NaN.
     """
-    try:
-        numbers = np.asarray(action, np.float32)
-    except (TypeError, ValueError, OverflowError):
-        raise UserError(f"action of {agent}: {shown(action)} is no array of numbers") from None
+    numbers = np.asarray(action, np.float32)
     if numbers.shape != (size,):
         got = numbers.shape
         raise UserError(f"an action is an array of shape ({size},), got {got} for {agent}")
@@ -336,24 +327,16 @@ def to_action(action: Any, size: int, agent: str = "the team") -> Array:
     return numbers
 
 
-def team_spaces(env: EnvBase, config: WildfireConfig) -> tuple[Box, dict[str, Box]]:
-    """Returns the spaces of the vector, and of the other tensors of an observation by name."""
+def observation_space(env: EnvBase, config: WildfireConfig) -> tuple[Box, Space]:
+    """Returns the space of the vector of an observation, and that of the whole observation."""
     low, high = _bounds(config, env.observation_spec[keys.OBSERVATION].shape[-1])
+    vector = Box(low, high, dtype=np.float32)
     _, *others = keys.observation_keys(env.observation_spec)
-    pictures: dict[str, Box] = {}
+    spaces: dict[str, Space] = {keys.OBSERVATION[1]: vector}
     for key in others:
         spec = env.observation_spec[key]
-        pictures[key[1]] = Box(0, 1 if spec.dtype == torch.bool else 255, spec.shape[2:], np.uint8)
-    return Box(low, high, dtype=np.float32), pictures
-
-
-def observation_space(vector: Box, pictures: dict[str, Box]) -> Space:
-    """Returns a new space of one agent's observations."""
-    copied = Box(vector.low, vector.high, dtype=np.float32)
-    if not pictures:
-        return copied
-    other = {name: Box(box.low, box.high, dtype=np.uint8) for name, box in pictures.items()}
-    return Dict({keys.OBSERVATION[1]: copied, **other})
+        spaces[key[1]] = Box(0, 1 if spec.dtype == torch.bool else 255, spec.shape[2:], np.uint8)
+    return vector, Dict(spaces) if others else vector
 
 
 def _bounds(config: WildfireConfig, features: int) -> tuple[Array, Array]:

@@ -231,13 +231,7 @@ def load_fires(
     if isinstance(fire, ScenarioConfig):
         return fires_of(fire).train(config.grid, config.horizon), False
     # A copy, because the caller may change theirs later.
-    try:
-        bank = torch.as_tensor(fire, dtype=torch.float32)
-    except (TypeError, ValueError, RuntimeError):
-        raise UserError(
-            f"fire: a scenario's name, a FireConfig or arrival times, not {type(fire).__name__}"
-        ) from None
-    bank = bank.clone(memory_format=torch.contiguous_format)
+    bank = torch.as_tensor(fire, dtype=torch.float32).clone(memory_format=torch.contiguous_format)
     shape = list(bank.shape)
     bank = bank.unsqueeze(0) if bank.ndim == 2 else bank
     times = (2,) if bank.ndim == 4 else ()

@@ -64,13 +64,10 @@ class WildfireEnv(EnvBase):
             X, Y] for one each; or arrival and burn-out times, [1, 2, X, Y] or [num_envs, 2, X, Y].
         seed: of all random numbers; the first reset draws a fresh one if None. Environment i's
             randomness depends on (seed, i) alone. Several seeds have equal shares of the
-            environments, in order; each is the same as with its seed alone, unless `staggered`.
+            environments, in order; each is the same as with its seed alone.
         device: where all tensors live.
         agent_done: whether done, terminated and truncated stand under "agents" too, per UAV.
         hold: steps for which a call of `step` holds its action; the reward is the sum over them.
-        staggered: whether environments are out of phase: the first episode of environment i after
-            seeding is truncated after horizon * (i + 1) / num_envs steps, rounded up to a multiple
-            of `hold`.
         true_map: whether the map is written under `keys.TRUE_MAP`.
 
     Raises:
@@ -88,7 +85,6 @@ class WildfireEnv(EnvBase):
     _time: Tensor
     _position: Tensor
     _ahead: Tensor
-    _first_length: Tensor
     _fail_step: Tensor | None
     _all_alive: Tensor
 
@@ -102,7 +98,6 @@ class WildfireEnv(EnvBase):
         *,
         hold: int = 1,
         agent_done: bool = False,
-        staggered: bool = False,
         true_map: bool = False,
     ):
         num_envs = check_whole("num_envs", num_envs)
@@ -116,7 +111,7 @@ class WildfireEnv(EnvBase):
             raise UserError(
                 f"hold={hold}: expected a divisor of the horizon, {self.config.horizon} steps"
             )
-        self._agent_done, self._staggered, self._shows_map = agent_done, staggered, true_map
+        self._agent_done, self._shows_map = agent_done, true_map
         self._steer: Callable[[TensorDictBase], TensorDictBase] | None = None
         self._communicate: Callable[..., Any] | None = None
         self._fire_name = fire if isinstance(fire, str) else getattr(fire, "name", None)
@@ -151,9 +146,6 @@ class WildfireEnv(EnvBase):
         position = torch.zeros(num_envs, config.num_uavs, 3, dtype=torch.float64)
         self.register_buffer("_position", position)
         self.register_buffer("_ahead", torch.arange(1, self.hold + 1)[:, None], persistent=False)
-        length, share = torch.arange(1, num_envs + 1) * config.horizon, num_envs * self.hold
-        first_length = (length + share - 1) // share * self.hold
-        self.register_buffer("_first_length", first_length, persistent=False)
 
     def _make_specs(self) -> None:
         """Declares the tensors that the environment reads and writes; see `keys`."""
@@ -231,7 +223,6 @@ class WildfireEnv(EnvBase):
         tensordict: TensorDictBase | None = None,
         *,
         position: Tensor | None = None,
-        **unknown: Any,
     ) -> TensorDictBase:
         """Starts an episode in the environments that "_reset" names, else in all.
 
@@ -239,8 +230,6 @@ class WildfireEnv(EnvBase):
             position: start positions in cells, [num_envs, num_uavs, 3] or [num_uavs, 3]; random by
                 default.
         """
-        if unknown:
-            raise UserError(f"reset: {', '.join(sorted(unknown))} not known; known: position")
         if not self._seeded:
             # Not before the first reset: copies of an unseeded environment draw their own seeds.
             self._set_seed(None)
@@ -407,10 +396,7 @@ class WildfireEnv(EnvBase):
 
     def _done(self, time: Tensor) -> dict[str, Tensor]:
         """Returns the flags at steps [..., num_envs], bool [..., num_envs, 1]."""
-        length = self.config.horizon
-        if self._staggered:
-            length = torch.where(self._episode == 1, self._first_length, length)
-        truncated = (time >= length).unsqueeze(-1)
+        truncated = (time >= self.config.horizon).unsqueeze(-1)
         flags = truncated, torch.zeros_like(truncated), truncated.clone()
         return dict(zip(_DONE, flags, strict=True))
 

@@ -10,7 +10,6 @@ from torchrl.envs import TransformedEnv
 from emberlink.comm.base import Communication
 from emberlink.envs.scenarios import ScenarioConfig, grid_of
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import check_device
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.hold import held
 from emberlink.policies.networks.messages import message_bytes
@@ -49,7 +48,6 @@ def make_env(
     Raises:
         UserError: a method, setup, world or setting is not known, or a value is out of range.
     """
-    check_device(str(device))
     grid = grid_of(fire)
     if grid is not None:
         settings.setdefault("grid", list(grid))

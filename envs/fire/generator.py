@@ -168,12 +168,11 @@ def make_fires(
     seeds: Tensor,
     grid: tuple[int, int],
     horizon: int,
-    device: torch.device | str | None = None,
 ) -> Tensor:
     """Returns the times of one fire per seed. A fire depends on its seed alone.
 
     Args:
-        seeds: int64 [fires].
+        seeds: int64 [fires], on the device where to compute.
         grid: (X, Y), each 8 to 256 cells.
         horizon: steps. Later arrivals are inf. A longer horizon continues the same fires.
 
@@ -182,7 +181,6 @@ def make_fires(
         `ReactionConfig` arrival and burn-out times, float32 [fires, 2, X, Y].
     """
     check_grid(grid)
-    seeds = seeds.to(device=device, dtype=torch.int64)
     if isinstance(config, ReactionConfig):
         return reaction_fires(config, seeds, grid, horizon)
     refine = math.ceil(_MIN_NODES / min(grid))

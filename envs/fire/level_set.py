@@ -105,7 +105,6 @@ def arrival_times(
     max_rate: float | None = None,
     max_step: float = math.inf,
     device: torch.device | str | None = None,
-    dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Computes when a front that starts at `distance` = 0 arrives at the centre of each cell.
 
@@ -121,15 +120,13 @@ def arrival_times(
         max_rate: upper bound of (head rate + speed of the drift) · multiplier, cells per step;
             needed if `head_ros` or `drift` is a function.
         max_step: upper bound of a time step, for functions that vary faster than the front moves.
-        device, dtype: of the computation; float64 is for studies of accuracy.
+        device: of the computation.
 
     Returns:
         [fires, X, Y], steps: 0 where the front is at the start, inf where it does not arrive.
     """
-    if refine < 1 or horizon <= 0 or min(grid) < 1:
-        raise UserError(f"expected refine, horizon, grid > 0; got {refine}, {horizon}, {grid}")
     pad = _PAD + margin
-    x, y = (_nodes(cells, pad, refine, device, dtype) for cells in grid)
+    x, y = (_nodes(cells, pad, refine, device) for cells in grid)
     phi = distance(x[None, :, None], y[None, None, :])
     rates = None if rate_field is None else _refined(rate_field.to(phi), grid, x, y)
     step = COURANT / refine / max(_rate_bound(head_ros, drift, rates, max_rate), 1e-12)
@@ -181,12 +178,10 @@ def _march(phi: Tensor, wave: _Wave, border: int, horizon: float, step: float) -
     return arrival.masked_fill(arrival > horizon, math.inf)
 
 
-def _nodes(
-    cells: int, pad: int, refine: int, device: torch.device | str | None, dtype: torch.dtype
-) -> Tensor:
+def _nodes(cells: int, pad: int, refine: int, device: torch.device | str | None) -> Tensor:
     """Returns the fine nodes of one axis; every `refine`-th is the centre of a cell."""
     count = (cells - 1 + 2 * pad) * refine + 1
-    return torch.arange(count, device=device, dtype=dtype) / refine - pad
+    return torch.arange(count, device=device, dtype=torch.float32) / refine - pad
 
 
 def _rate_bound(
@@ -204,10 +199,6 @@ def _rate_bound(
 
 def _refined(field: Tensor, grid: tuple[int, int], x: Tensor, y: Tensor) -> Tensor:
     """Returns the multiplier at the nodes: bilinear, 0 on barriers, their edges and corners."""
-    if field.dim() != 3 or tuple(field.shape[1:]) != tuple(grid):
-        raise UserError(f"rate_field must be [fires, {grid[0]}, {grid[1]}], got {field.shape}")
-    if not (field >= 0).all():
-        raise UserError(f"rate_field must not be negative, got {field.min().item()}")
     free = (field > 0).to(field)
     u, v = x.clamp(0, grid[0] - 1), y.clamp(0, grid[1] - 1)
 

@@ -47,7 +47,7 @@ def printable(text: str) -> str:
 
 def one_line(text: str) -> str:
     """Returns a message on one line, without control characters, with its longest words cut."""
-    line = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+    line = printable(" ".join(text.split()))
     return re.sub(r"\S{1000,}", lambda word: f"{word[0][:300]}...{word[0][-100:]}", line)
 
 

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import shown
 
 _BELOW_ONE = 1 - 2**-22  # so that rounding does not carry a UAV across the edge of the box
 
@@ -78,15 +77,12 @@ def given_points(given: Any, shape: Sequence[int], low: Tensor, high: Tensor) ->
         low, high: [3], the corners of the box, cells.
 
     Raises:
-        UserError: they are no numbers, have another shape, or lie outside of the box.
+        UserError: they have another shape, or lie outside of the box.
     """
     shapes = [*shape[1:]], [*shape]
     box = f"{low.tolist()} to {high.tolist()}"
     expected = f"expected {shapes[0]} or {shapes[1]} inside the box {box}"
-    try:
-        points = torch.as_tensor(given, dtype=torch.float32, device=low.device)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        raise UserError(f"position: {shown(given)} is no array of numbers; {expected}") from None
+    points = torch.as_tensor(given, dtype=torch.float32, device=low.device)
     if [*points.shape] not in shapes:
         raise UserError(f"position: shape {list(points.shape)}; {expected}")
     if not ((points >= low) & (points <= high)).all():
@@ -96,12 +92,7 @@ def given_points(given: Any, shape: Sequence[int], low: Tensor, high: Tensor) ->
 
 
 def next_waypoint(
-    waypoint: Tensor,
-    position: Tensor,
-    key: Tensor,
-    low: Tensor,
-    high: Tensor,
-    due: Tensor | None = None,
+    waypoint: Tensor, position: Tensor, key: Tensor, low: Tensor, high: Tensor
 ) -> Tensor:
     """Returns the waypoints, with a new random one for each UAV closer than 1 cell to its own.
 
@@ -109,11 +100,8 @@ def next_waypoint(
         waypoint, position: float32 [..., n, 3], cells.
         key: int64 [...], a random key for this purpose alone.
         low, high: [3], the corners of the box, cells.
-        due: bool [...], where all UAVs get a new one.
     """
     redraws = distance(position, waypoint) < 1
-    if due is not None:
-        redraws = redraws | due.unsqueeze(-1)
     points = random_points(key, position.shape[-2], low, high)
     return torch.where(redraws.unsqueeze(-1), points, waypoint)
 

@@ -59,16 +59,6 @@ def test_done_per_agent():
     assert ("agents", "done") not in make().reset().keys(True)
 
 
-def test_staggered_first_episodes():
-    env = make(4, staggered=True, seed=0)
-    steps = env.rollout(30, break_when_any_done=False)["next"]
-    ends = [(row.squeeze(-1).nonzero().flatten() + 1).tolist() for row in steps["truncated"]]
-    # 4 environments, 10 steps: the first episodes have 3, 5, 8 and 10 steps, all later ones 10.
-    assert ends == [[3, 13, 23], [5, 15, 25], [8, 18, 28], [10, 20, 30]]
-    assert steps[keys.STEP][0, :5].tolist() == [1, 2, 3, 1, 2]
-    assert starts(make(4, staggered=True, seed=0)).equal(starts(make(4, seed=0)))
-
-
 @pytest.mark.filterwarnings("error")
 def test_the_team_as_one_agent_of_gymnasium():
     name = "emberlink.envs.gymnasium:emberlink/WildfireTeam-v0"

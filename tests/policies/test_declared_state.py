@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from torchrl.collectors import Collector
-from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import ParallelEnv, SerialEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
 
 from emberlink.envs import keys, parallel_env
@@ -125,6 +125,7 @@ def test_exported_policy_acts_as_the_policy(policy):
     assert torch.allclose(torch.stack(actions, 1)[0], alone(policy)[0, :HORIZON], atol=1e-5)
 
 
+@pytest.mark.slow  # torch.compile is imported for seconds
 def test_compiled_policy_acts_as_the_policy(policy):
     compiled = torch.compile(policy, backend="eager")
     with warnings.catch_warnings():
@@ -148,13 +149,6 @@ def test_policy_without_its_state_says_so_after_the_first_step(policy):
     td = step_mdp(env.step(policy(td)))
     with pytest.raises(UserError, match=r"carries .*held.* from step to step"):
         policy(td.exclude(HELD))
-
-
-def test_primer_adds_the_state_to_an_environment_without_it(policy):
-    config = policy.config
-    env = build_env(config, num_envs=1, fire=config.fire, seed=3, device="cpu")
-    env = TransformedEnv(env, policy.make_tensordict_primer())
-    assert env.rollout(HORIZON, policy)[keys.ACTION][0].equal(alone(policy)[0, :HORIZON])
 
 
 def test_own_loop_without_primer_keeps_the_state(policy):

@@ -4,9 +4,7 @@ import logging
 import os
 import pwd
 from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
 
-import pytest
 from refusal import refused
 from tiny_run import TINY
 from torchrl.envs.utils import exploration_type
@@ -14,7 +12,6 @@ from torchrl.envs.utils import exploration_type
 from emberlink import trainers
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.sweep.executors import submitit
 
 SHORT = {"horizon": 15, "num_uavs": 2, "num_envs": 2, "batch_size": 8, "evaluation.episodes": 2}
 SHORT |= {"episodes": 4, "evaluation.interval": 1, "evaluation.interval_episodes": 2}
@@ -58,20 +55,3 @@ def test_an_account_without_a_home_folder_is_one_line(monkeypatch, capsys):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(pwd, "getpwuid", {}.__getitem__)
     refused(["train", "independent", *TINY], capsys, "HOME")
-
-
-@pytest.mark.parametrize("pattern", ["%A_%a", "100%"])
-def test_patterns_of_slurm_in_a_path(pattern, tmp_path, monkeypatch):
-    monkeypatch.setenv("EMBERLINK_CACHE", str(tmp_path / "cache"))
-    made = []
-    update = SimpleNamespace(update_parameters=lambda **_: None)
-    monkeypatch.setattr(submitit, "require", lambda *_: None)
-    library = SimpleNamespace(AutoExecutor=lambda folder, *_, **__: made.append(folder) or update)
-    monkeypatch.setattr(submitit, "import_module", lambda _: library)
-    executor = submitit.SubmititExecutor(submitit.SubmititConfig())
-    executor._make(tmp_path / pattern)
-    executor._make(tmp_path / pattern)  # again, when the sweep is repeated
-    assert "%" not in str(made[0])
-    assert made[0] == made[1]
-    (made[0] / "log.txt").write_text("")
-    assert (tmp_path / pattern / "log.txt").exists()

@@ -279,6 +279,7 @@ def test_a_missing_package_is_an_error_before_training(logger, monkeypatch, caps
     assert not Path("runs").exists()
 
 
+@pytest.mark.slow
 def test_wandb_cannot_reach_its_server(tmp_path, monkeypatch):
     """No server listens at port 9 of the local machine, and the key is invalid."""
     monkeypatch.setenv("WANDB_MODE", "online")

@@ -87,17 +87,10 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Restores the state of `optimizer_tensors`; the parameter groups do not change.
-
-    Raises:
-        ValueError: a tensor is neither a scalar nor of its parameter's shape.
-    """
-    parameters = [value for entry in optimizer.param_groups for value in entry["params"]]
+    """Restores the state of `optimizer_tensors`; the parameter groups do not change."""
     state: dict[int, dict[str, Tensor]] = {}
     for name, value in tensors.items():
         index, _, key = name.partition(".")
-        if value.ndim and value.shape != parameters[int(index)].shape:
-            raise ValueError(f"optimizer tensor {name} has shape {list(value.shape)}")
         state.setdefault(int(index), {})[key] = value
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": state, "param_groups": groups})

@@ -35,15 +35,15 @@ def read_run(text: str) -> RunFolder:
     return RunFolder(find_one(text) if is_name(text) else text)
 
 
-def open_run(text: str, output: Path | str = "runs") -> RunFolder:
+def open_run(text: str) -> RunFolder:
     """Returns the run of `read_run`, to be written to.
 
-    A trained policy of the package is copied to a run folder in `output`, unless there is a copy.
+    A trained policy of the package is copied to a run folder in `runs`, unless there is a copy.
     """
     if not is_name(text):
         return RunFolder(text)
     source = find_one(text)
-    run = RunFolder(Path(output) / "_".join([_COPY, *source.parts[-3:]]))
+    run = RunFolder(Path("runs") / "_".join([_COPY, *source.parts[-3:]]))
     with naming(run.path):
         run.path.mkdir(parents=True, exist_ok=True)
         if not run.newest.exists():

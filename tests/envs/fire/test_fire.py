@@ -41,7 +41,7 @@ def paper() -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def test_fires() -> torch.Tensor:
-    return make_fires(load_scenario("huygens"), fire_seeds("test", 200), GRID, HORIZON)
+    return make_fires(load_scenario("huygens"), fire_seeds("test", 100), GRID, HORIZON)
 
 
 def test_paper_is_the_measured_fire(paper: torch.Tensor):
@@ -66,15 +66,15 @@ def test_huygens_counts(test_fires: torch.Tensor):
     good = (start >= 60) & (start <= 120) & (end >= 110) & (end <= 190)
     assert good.double().mean() >= 0.95
     assert end.double().std() > 10
-    assert len(test_fires.flatten(1).unique(dim=0)) == 200
+    assert len(test_fires.flatten(1).unique(dim=0)) == 100
     edge = torch.cat([test_fires[:, [0, -1]].flatten(1), test_fires[:, :, [0, -1]].flatten(1)], 1)
     assert (edge > 0).all()  # every fire starts in the box
     assert 0.15 < edge.isfinite().any(1).double().mean() < 0.3  # some fronts leave the box
 
 
 def test_a_fire_depends_on_its_seed_only(test_fires: torch.Tensor):
-    config, seeds = load_scenario("huygens"), fire_seeds("test", 200)
-    some = torch.tensor([150, 0, 7])
+    config, seeds = load_scenario("huygens"), fire_seeds("test", 100)
+    some = torch.tensor([50, 0, 7])
     state = torch.get_rng_state()
     assert torch.equal(make_fires(config, seeds[some], GRID, HORIZON), test_fires[some])
     assert torch.equal(make_fires(config, seeds[7:8], GRID, HORIZON), test_fires[7:8])
@@ -157,9 +157,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Counts how often fires are computed."""
     made, real = [], bank_module.make_fires
 
-    def counted(config, seeds, grid, horizon, device=None):
+    def counted(config, seeds, grid, horizon):
         made.append(len(seeds))
-        return real(config, seeds, grid, horizon, device)
+        return real(config, seeds, grid, horizon)
 
     monkeypatch.setattr(bank_module, "make_fires", counted)
     return made

@@ -94,7 +94,8 @@ def test_settings_after_the_world_change_it():
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
-    assert main(["train", "independent", "setup=tuned", *TINY, f"output={folder}"]) == 0
+    alone = "evaluation.scripted=[]", f"output={folder}"
+    assert main(["train", "independent", "setup=tuned", *TINY, *alone]) == 0
     (path,) = folder.iterdir()
     return path
 

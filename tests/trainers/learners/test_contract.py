@@ -24,6 +24,7 @@ SMALL = [
     *("evaluation.episodes=2", "evaluation.scripted=[lawnmower]", "fire.num_train_fires=2"),
 ]
 MAP = ["env.observation=map", "env.map.pixels=8"]
+IPPO = ["learner=ippo", "policy.memory=gru", "learner.epochs=2", "learner.minibatches=2"]
 CASES = {
     "ddpg": ["learner=ddpg", "policy.hold=5", "learner.batch_size=8"],
     "ddpg-team": ["learner=ddpg", "learner.critic=team", "learner.batch_size=8"],
@@ -36,10 +37,10 @@ CASES = {
         *("learner=td3", "learner.critic=team", "learner.batch_size=8"),
         "learner.share_parameters=true",
     ],
-    "ippo": ["learner=ippo", "policy.memory=gru", "policy.hold=5", *MAP],
-    "ippo-own": ["learner=ippo", "policy.memory=gru", "learner.share_parameters=false"],
+    "ippo": [*IPPO, "policy.hold=5", *MAP],
+    "ippo-own": [*IPPO, "learner.share_parameters=false"],
     "mappo": [
-        *("learner=mappo", "policy.memory=gru", "policy.agent_index=true", "env.failures=1"),
+        *("learner=mappo", *IPPO[1:], "policy.agent_index=true", "env.failures=1"),
         *("policy.message=attention", "policy.message_size=4", "learner.chunk=2"),
     ],
     "mappo-map": ["learner=mappo", "learner.critic_map=true", "policy.hold=4"],

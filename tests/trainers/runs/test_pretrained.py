@@ -33,7 +33,7 @@ def packed(tmp_path_factory) -> tuple[Path, list[Path]]:
     for method, seed, world in PACKED:
         output = folder / f"{method}{seed}"
         arguments = [method, "setup=tuned", f"world={world}", *TINY, f"seed={seed}"]
-        arguments += [f"output={output}"]
+        arguments += [f"output={output}", "evaluation.scripted=[]"]
         assert main(["train", *arguments]) == 0
         (run,) = output.iterdir()
         runs.append(run)

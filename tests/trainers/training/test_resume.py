@@ -24,10 +24,11 @@ SMALL = [
     *(f"env.horizon={HORIZON}", f"episodes={EPISODES}", "env.num_uavs=2", "num_envs=2"),
     *("learner.hidden=[8,8]",),
     *("evaluation.interval=0", "evaluation.interval_episodes=1", "evaluation.episodes=1"),
+    "evaluation.scripted=[]",
 ]
 # A replay buffer of 60 rows is full after 30 of the 80 steps.
 REPLAY = ["learner.batch_size=16", "learner.buffer_size=60"]
-GRU = ["policy.memory=gru", "policy.units=6"]
+GRU = ["policy.memory=gru", "policy.units=6", "learner.epochs=2", "learner.minibatches=2"]
 LEARNERS = {
     "ddpg": ["learner=ddpg", *REPLAY],
     "td3": ["learner=td3", *REPLAY, "learner.critic=team"],

@@ -1,6 +1,5 @@
 """Runs trainings as SLURM jobs, through submitit: an array for the tasks of each call."""
 
-import hashlib
 import os
 import signal
 import subprocess
@@ -15,7 +14,6 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
-from emberlink.envs.fire.cache import cache_folder
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import STRICT, CountOrZero
 from emberlink.trainers.sweep.executors.base import DIED, Executor, Positive, Task, require
@@ -140,7 +138,7 @@ class SubmititExecutor(Executor):
         """Returns submitit's executor, which writes to a folder; a RuntimeError without SLURM."""
         config = self._config
         executor = import_module("submitit").AutoExecutor(
-            _without_patterns(folder), config.cluster, slurm_max_num_timeout=config.requeues
+            folder, config.cluster, slurm_max_num_timeout=config.requeues
         )
         executor.update_parameters(
             name="emberlink",
@@ -188,15 +186,3 @@ class SubmititExecutor(Executor):
     def cancel(self, handle: _Handle) -> None:
         handle.grace = 0.0
         handle.job.cancel(check=False)
-
-
-def _without_patterns(folder: Path) -> Path:
-    """Returns the folder, or a link to it if submitit and SLURM would replace parts of its path."""
-    if "%" not in str(folder):
-        return folder
-    link = cache_folder() / "submitit" / hashlib.sha256(str(folder).encode()).hexdigest()[:16]
-    for parent in (folder, link.parent):
-        parent.mkdir(parents=True, exist_ok=True)
-    with suppress(FileExistsError):
-        link.symlink_to(folder)
-    return link
