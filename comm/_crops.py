@@ -11,7 +11,7 @@ CHANNELS = ("fire", "seen", "burnt_out", "near", "age", "outside", "uavs", "base
 _FULL = 255
 _OLD = 1000.0  # steps; the age of the darkest known cells
 _SPREAD = 50.0  # steps; time scale at which the chance of ignition near known fire grows
-_DRAWN = 2**21  # cells of maps that are drawn at a time
+_DRAWN = 2**17  # cells of maps that are drawn at a time; their sums fit into a cache
 # Bits of an int64 at which the sum over a pixel begins: counts of 10 bits, sums of bytes of 16.
 _FIRE, _SEEN, _BURNT_OUT, _NEAR, _AGE, _END = 0, 10, 20, 30, 46, 62
 
@@ -67,8 +67,10 @@ class Crops(nn.Module):
         ages = range(min(horizon, int(_OLD)) + 2)  # older looks have the bytes of the last age
         for age in ages:
             old, chance = age_byte(age) << _AGE, chance_byte(age) << _NEAR
-            never = (_FULL << _AGE) + (_FULL << _NEAR)
-            fields += [never, (1 << _BURNT_OUT) + old, (1 << _FIRE) + old, chance + old]
+            never = _FULL << _AGE, _FULL << _NEAR
+            burns, burnt_out = (old + (1 << kind) for kind in (_FIRE, _BURNT_OUT))
+            for known, may in (never, (burnt_out, 0), (burns, 0), (old, chance)):
+                fields += [known + seen + near for seen in (0, 1 << _SEEN) for near in (0, may)]
         self.register_buffer("_fields", torch.tensor(fields), persistent=False)
         self.register_buffer("_ages", torch.tensor([*map(age_byte, ages)]), persistent=False)
         edges = [
@@ -125,16 +127,14 @@ class Crops(nn.Module):
 
     def _summed(self, known: Tensor, seen: Tensor, step: Tensor) -> Tensor:
         """Returns the sums of all fields over the cells below and left, int64 [rows, X+1, Y+1]."""
-        index = 4 * step.view(-1, 1, 1) + 3 - known
-        # An environment may be stepped beyond its horizon, without a reset; a look keeps its kind.
-        index = index.minimum((index & 3) + (len(self._fields) - 4)).clamp_(min=0)
-        fields = self._fields.take(index)
+        age = (4 * step + 3).to(torch.int32).view(-1, 1, 1) - known
+        most = len(self._fields) // 4 - 4
+        if int(step.max()) >= most // 4:  # looks may be older than the table; they keep their kind
+            age = age.minimum((age & 3) + most)
+        kind = age.mul_(4).add_(seen, alpha=2)
         if self.spread:
-            near = _widened((known & 3 == 1) & (known >= 0), self.spread)
-        else:
-            near = torch.zeros_like(seen)
-        fields.bitwise_and_(torch.where(near, -1, ~(0xFFFF << _NEAR)))
-        fields += seen.long() << _SEEN
+            kind += _widened((known & 3 == 1) & (known >= 0), self.spread)
+        fields = self._fields.index_select(0, kind.flatten()).view_as(kind)
         # The sums overflow; their differences, which fit into the fields, are exact all the same.
         return torch.nn.functional.pad(fields.cumsum(2).cumsum(1), (1, 0, 1, 0))
 

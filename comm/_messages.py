@@ -118,7 +118,7 @@ class CellMessages(nn.Module):
         last, seen = known.last_seen, known.seen_fire
         assert seen is not None
         self._meet(last, seen, near & ~self.heard)
-        told = self.fresh.view(-1).nonzero().squeeze(-1)
+        told = _told(self.fresh, near)
         row, theirs = _heard_by(near, told, last.shape[2])
         new = _is_new(
             (last.take(told)[row], seen.take(told)[row]), (last.take(theirs), seen.take(theirs))
@@ -179,6 +179,18 @@ class CellMessages(nn.Module):
         fresh[theirs[relays.take(link)]] = True
         self.heard.copy_(near)
         return self.size * said.bincount(minlength=near.shape[:2].numel()).view(near.shape[:2])
+
+
+def _told(fresh: Tensor, near: Tensor) -> Tensor:
+    """Returns the entries that are marked in the maps of UAVs which somebody hears, sorted."""
+    area = fresh.shape[2]
+    speaker = near.any(1).view(-1).nonzero().squeeze(-1)
+    maps = fresh.flatten(0, 1).index_select(0, speaker).flatten()
+    # Eight flags are read at a time, as most of them are not set.
+    eights = nn.functional.pad(maps, (0, -len(maps) % 8)).view(-1, 8)
+    some = eights.view(torch.int64).squeeze(-1).nonzero().squeeze(-1)
+    at = (8 * some.unsqueeze(-1) + torch.arange(8, device=maps.device))[eights[some]]
+    return speaker.take(at // area) * area + at % area
 
 
 def _heard_by(near: Tensor, told: Tensor, area: int) -> tuple[Tensor, Tensor]:

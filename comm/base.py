@@ -132,13 +132,13 @@ class CommModule(TensorDictModuleBase):
             bonus.append(self.shaping(step))
             last = self.rewrite(step)
             sent.append(self.bytes_sent(last) if self.counts else None)
-        return Heard(last, _stacked(bonus), _stacked(sent))
+        return Heard(self.show(last), _stacked(bonus), _stacked(sent))
 
     def rewrite(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Enters what the UAVs see into their maps, if they have any, and calls `forward`."""
         if self.maps is not None:
             self.maps.look(tensordict)
-        return self.show(self(tensordict))
+        return self(tensordict)
 
     def show(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Draws the UAVs' maps where they decide at a time step."""
@@ -255,7 +255,7 @@ class Communication(Transform):
         if module.maps is not None:
             module.maps.start_episodes(mask)
         self._listen([tensordict])
-        heard = module.rewrite(tensordict)
+        heard = module.show(module.rewrite(tensordict))
         sent = module.bytes_sent(heard) if module.counts else None
         sent = None if sent is None else sent.unsqueeze(0)
         for key, value in self._bytes([heard], sent).items():
