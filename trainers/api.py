@@ -6,7 +6,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,11 @@ from emberlink.trainers.comparison.report import free_folder, write_report
 from emberlink.trainers.config.basics import MAX_FIRES
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.values import GROUPS
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
-from emberlink.trainers.evaluation.policy import TrainedPolicy, load_policy
+from emberlink.trainers.evaluation.evaluate_run import evaluate_run
+from emberlink.trainers.evaluation.foreign import FOREIGN, foreign_config, new_run, open_policy
+from emberlink.trainers.evaluation.policy import TrainedPolicy, foreign_actor, load_policy
 from emberlink.trainers.evaluation.scores import Results
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.terminal.signals import Interruption
@@ -111,8 +114,10 @@ def resume(
 
 
 def evaluate(
-    run: Reference,
+    policy: Any,
+    method: str | None = None,
     *,
+    name: str = "",
     episodes: int | None = None,
     scripted: bool = True,
     checkpoint: Reference | None = None,
@@ -120,10 +125,17 @@ def evaluate(
     progress: Callable[[str, str], None] | None = None,
     **settings: Any,
 ) -> Results:
-    """Evaluates the frozen policy of a run on test fires without writing files.
+    """Evaluates a frozen policy on test fires.
 
     Args:
-        run, checkpoint, device, settings: see `load`.
+        policy: a run, see `load`, of which no file is written; or with `method` a policy of your
+            own: a TensorDictModule, an `nn.Module`, a function (`foreign.ForeignPolicy`), or a text
+            `module:NAME`, `file.py:NAME` or `file.onnx`.
+        method: the method whose observations a policy of your own reads. `settings` are then those
+            of `train` (`setup`, `world`, `fire`, `seed`, ...), since there is no run.
+        name: of a policy of your own: writes a run folder in `output`, which `compare` reads and
+            calls by this name; later commands can open the policy if it was given as a text.
+        checkpoint, device, settings: see `load`.
         episodes: number of episodes, each on another fire; if None, the run's
             `evaluation.episodes`.
         scripted: whether to evaluate the scripted policies, too.
@@ -135,16 +147,30 @@ def evaluate(
     Raises:
         UserError: see `load`.
     """
-    policy = load(run, checkpoint=checkpoint, device=device, **settings)
-    count = policy.config.evaluation.episodes
+    reference = ""
+    if method is None:
+        loaded = load(policy, checkpoint=checkpoint, device=device, **settings)
+        config, actor = loaded.config, loaded.actor
+    else:
+        if isinstance(policy, str):
+            policy, reference = open_policy(policy)
+        chosen = [f"{key}={settings.pop(key)}" for key in GROUPS if key in settings]
+        settings |= {} if device is None else {"device": device}
+        config = foreign_config(policy, method, chosen, **settings)
+        actor = foreign_actor(policy, name or "policy", config)
+    count = config.evaluation.episodes
     if episodes is not None:
         count = check_whole("episodes", episodes)
     if not 1 <= count <= MAX_FIRES:
         raise UserError(f"episodes={count}: expected 1 to {MAX_FIRES}")
     report = progress or (lambda *_: None)
-    return evaluate_policy(
-        policy.config, policy.actor, fires=count, scripted=scripted, report=report
-    )
+    if not scripted:
+        config = replace(config, evaluation=replace(config.evaluation, scripted=()))
+    if method is None or not name:
+        return evaluate_policy(config, actor, fires=count, report=report)
+    run = new_run(reference, name, config)
+    about: Any = {"checkpoint": run.path / FOREIGN, "about": [name]}
+    return evaluate_run(run, config, actor, fires=count, report=report, **about)
 
 
 def load(

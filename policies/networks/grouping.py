@@ -19,8 +19,10 @@ class Grouping:
 
     def split(self, x: Tensor, batch: torch.Size) -> Tensor:
         """Maps [*batch, *features], with the batch [..., uavs], to [groups, rows, *features]."""
-        x = x.reshape(math.prod(batch[:-1]), self.uavs, *x.shape[len(batch) :])
-        return x.flatten(0, 1).unsqueeze(0) if self.shared else x.transpose(0, 1)
+        features = x.shape[len(batch) :]
+        if self.shared:
+            return x.reshape(1, math.prod(batch), *features)
+        return x.reshape(math.prod(batch[:-1]), self.uavs, *features).transpose(0, 1)
 
     def join(self, x: Tensor, batch: torch.Size) -> Tensor:
         """Reverses `split`: maps [groups, rows, features] to [*batch, features]."""

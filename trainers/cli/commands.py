@@ -91,17 +91,27 @@ def add_eval(commands: Any) -> None:
         commands,
         "eval",
         _eval,
-        "evaluate the frozen policies of a run",
+        "evaluate the frozen policies of a run, or a policy of your own",
         "Plays the policies of a run's newest checkpoint and the scripted ones on the same test "
-        "fires, prints a table, and writes eval.json, figures, GIF and replay page to the run.",
-        "emberlink eval runs/2026-01-31_12-00-00_consensus_tuned_paper_s0 --fires 64",
+        "fires, prints a table, and writes eval.json, figures, GIF and replay page to the run. A "
+        "policy of your own gets a run folder, which compare and render read.",
+        "emberlink eval mine.py:act independent setup=tuned --name mine",
+        usage="emberlink eval RUN [key=value ...]\n"
+        "       emberlink eval POLICY METHOD [key=value ...] --name NAME",
     )
-    add("folder", metavar="RUN", help="a run folder, or pretrained:METHOD, pretrained:SETUP/METHOD")
+    add(
+        "folder",
+        metavar="RUN | POLICY",
+        help="a run folder, pretrained:METHOD or pretrained:SETUP/METHOD; or a policy of your own: "
+        "file.py:NAME, module:NAME or file.onnx",
+    )
     _add_overrides(
         add,
         "keys of comm. or env. to change, such as env.radio.loss=0.5, world=NAME, or "
-        "evaluation.scripted=[] for the frozen policies alone; the names of the files contain them",
+        "evaluation.scripted=[] for the frozen policies alone; the names of the files contain "
+        "them. After POLICY: the method whose observations it reads, and keys as for train",
     )
+    add("--name", help="what comparisons call a policy of your own")
     add("--checkpoint", metavar="FILE", type=path, help="a checkpoint (default: the newest)")
     fires = between(1, MOST_FIRES)
     add("--fires", metavar="N", type=fires, help="number of episodes (default: the run's)")
@@ -112,6 +122,26 @@ def _eval(options: argparse.Namespace, console: "Console") -> int:
     from emberlink.trainers.evaluation.evaluate_run import run_command
 
     return run_command(options, console)
+
+
+def add_export(commands: Any) -> None:
+    add = command(
+        commands,
+        "export",
+        _export,
+        "write the policy of a run as an ONNX file",
+        "Writes the networks of a run's newest checkpoint as FILE.onnx, and FILE.json, which says "
+        "what they read and write, in which units. No existing file is replaced.",
+        "emberlink export pretrained:consensus consensus.onnx",
+    )
+    add("folder", metavar="RUN", help="a run folder, or pretrained:METHOD, pretrained:SETUP/METHOD")
+    add("file", metavar="FILE.onnx", type=path, help="a new file")
+
+
+def _export(options: argparse.Namespace, console: "Console") -> int:
+    from emberlink.trainers.evaluation.export import export
+
+    return export(options.folder, options.file, console)
 
 
 def add_compare(commands: Any) -> None:

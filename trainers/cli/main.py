@@ -95,7 +95,7 @@ def _parser() -> tuple[Parser, list[str]]:
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for add in (
-        *(of.add_train, of.add_eval, of.add_compare, of.add_render),
+        *(of.add_train, of.add_eval, of.add_export, of.add_compare, of.add_render),
         *(of.add_sweep, add_fire, of.add_world, add_list, of.add_doctor),
     ):
         add(commands)

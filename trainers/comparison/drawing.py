@@ -49,12 +49,16 @@ CURVES_CAPTION = (
 )
 
 
-def training(curves: Frame, scripted: Frame, measures: Sequence[str]) -> Figure:
+def training(
+    curves: Frame, scripted: Frame, measures: Sequence[str], labels: Sequence[str]
+) -> Figure:
     """Returns training curves: the interquartile mean over seeds and its interval for each label.
 
-    Each measure has a panel, with the results of scripted policies on the fires trained on.
+    Each measure has a panel, with the results of scripted policies on the fires trained on. Colours
+    are those of `labels` in `frozen`.
     """
-    colours = _colours(list(curves["label"].unique()))
+    has_curve = set(curves["label"])
+    colours = {label: colour for label, colour in _colours(labels).items() if label in has_curve}
     dashes = _dashes(scripted)
     lines = len(dashes) + sum(1 + _wrapped(name).count("\n") for name in colours)
     figure = Figure(figsize=(10.8, max(3.8, 0.4 + 0.2 * lines)), layout="constrained")

@@ -119,8 +119,9 @@ def differing(runs: Frame) -> Frame:
 
 def curves(runs: Frame) -> Frame:
     """Returns the interquartile mean over seeds, `iqm`, of each training episode of a section."""
-    parts: list[Frame] = []
-    for label, group in runs[runs["as_trained"]].groupby("label"):
+    parts = [pd.DataFrame(columns=["section", "label", "measure", "episode", "iqm", "low", "high"])]
+    trained = runs[runs["as_trained"] & runs["object"].map(lambda run: len(run.lines) > 0)]
+    for label, group in trained.groupby("label"):
         for measure in CURVES:
             values = np.array([[line[measure] for line in r.lines] for r in group["object"]], float)
             ends = bootstrap.interval(bootstrap.iqm, values, axis=0, resamples=BAND_RESAMPLES)

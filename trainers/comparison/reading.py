@@ -17,6 +17,7 @@ from pydantic.dataclasses import dataclass as checked
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import describe, shown
 from emberlink.trainers.config.values import flat
+from emberlink.trainers.evaluation.foreign import foreign_name
 from emberlink.trainers.evaluation.scores import CURVES, LEARNED
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.compact_json import infinite
@@ -135,7 +136,8 @@ def read(path: Path) -> Run:
     folder = RunFolder(path)
     settings = {"world": "paper", "edition": 1, **flat(folder.values())}
     _check_types(settings, path / "config.yaml")
-    lines = _curves(folder, settings["episodes"])
+    name = foreign_name(folder)
+    lines = [] if name else _curves(folder, settings["episodes"])
     again = f"emberlink eval {shlex.quote(str(path))}"
     if not (path / "eval.json").exists():
         raise UserError(f"not evaluated: there is no eval.json ({again})")
@@ -147,7 +149,7 @@ def read(path: Path) -> Run:
         raise UserError(
             f"eval.json is of step {tested}, the newest checkpoint of {trained} ({again})"
         )
-    return Run(path, settings["method"], settings, lines, evaluation)
+    return Run(path, name or settings["method"], settings, lines, evaluation)
 
 
 def _check_types(settings: Mapping[str, Any], file: Path) -> None:

@@ -246,7 +246,7 @@ def _chapter(
     training = []
     for number, (measures, content) in drawing.FIGURES.items():
         caption = f"The paper's figure {number}. {content} {drawing.CURVES_CAPTION}"
-        figure = drawing.training(curves, scripted, measures)
+        figure = drawing.training(curves, scripted, measures, labels)
         training.append(saved(figure, f"figure_{number}", caption))
     return {
         "title": section,
@@ -307,7 +307,7 @@ def _details(runs: Frame, folder: Path) -> list[Table]:
     settings = differing(runs).rename_axis("policy").reset_index()
     trained = runs[runs["as_trained"]]
     rows = trained[["label", "seed", "radio"]].rename(columns={"label": "policy"})
-    rows["episodes of training"] = [run.settings["episodes"] for run in trained["object"]]
+    rows["episodes of training"] = [len(run.lines) for run in trained["object"]]
     rows["folder"] = trained["run"]
     pages = [Path(run) / "figures" / "replay.html" for run in trained["run"]]
     rows["replay"] = [

@@ -3,6 +3,7 @@
 import hashlib
 import inspect
 import json
+import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -114,7 +115,6 @@ def evaluate(
     actor: Policy,
     *,
     fires: int,
-    scripted: bool = True,
     report: Callable[[str, str], None] = lambda *_: None,
     watch: Watch | None = None,
 ) -> Results:
@@ -138,8 +138,13 @@ def evaluate(
         say(LEARNED)
         watched = watch if fire == shown_scenario(config) else None
         results[fire] = {LEARNED: play_learned(config, actor, arrival, watch=watched)}
-        for name in config.evaluation.scripted if scripted else ():
-            results[fire][name] = play_scripted(config, name, arrival, report=say)
+        for name in config.evaluation.scripted:
+            try:
+                results[fire][name] = play_scripted(config, name, arrival, report=say)
+            except Exception as error:
+                if SCRIPTED.find(name).__module__.startswith("emberlink."):
+                    raise
+                warnings.warn(f"{name}: {type(error).__name__}: {error}; left out", stacklevel=2)
     return results
 
 

@@ -15,8 +15,16 @@ from emberlink.envs.utils.errors import UserError, naming
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate, figures
 from emberlink.trainers.evaluation.episodes import recorder_of, title_of
+from emberlink.trainers.evaluation.foreign import (
+    FOREIGN,
+    foreign_config,
+    foreign_name,
+    is_reference,
+    new_run,
+    open_policy,
+)
 from emberlink.trainers.evaluation.policy import load_policy
-from emberlink.trainers.evaluation.scores import LEARNED, Results, print_results
+from emberlink.trainers.evaluation.scores import LEARNED, Results, print_results, reporter
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.recording import Episode
 from emberlink.trainers.replay.screen import Screen, even_steps
@@ -31,6 +39,8 @@ _MAX_LABEL = 150
 def run_command(options: argparse.Namespace, console: Console) -> int:
     """Runs `emberlink eval`: evaluates a run, prints the table and returns 0."""
     changes, file = options.overrides, options.checkpoint
+    if is_reference(options.folder):
+        options.folder, changes = str(_foreign_run(options)), []
     policy = load_policy(read_run(options.folder), changes, checkpoint=file, device=options.device)
     run = open_run(options.folder)  # copies a trained policy of the package once all is checked
     about = [file.stem] if file else []
@@ -44,13 +54,26 @@ def run_command(options: argparse.Namespace, console: Console) -> int:
         policy,
         checkpoint=policy.checkpoint,
         fires=options.fires or policy.config.evaluation.episodes,
-        report=lambda text: console.print(f"  {text}", style="dim", soft_wrap=True),
+        report=reporter(console),
         label=label,
         about=[*changes, *about],
     )
-    print_results(console, results, policy.config)
+    print_results(console, results, policy.config, foreign_name(run))
     console.print(str(run.path), soft_wrap=True)
     return 0
+
+
+def _foreign_run(options: argparse.Namespace) -> Path:
+    """Creates the run folder of a policy that emberlink has not trained."""
+    method, *settings = options.overrides or [""]
+    if not method or "=" in method or not options.name or options.checkpoint:
+        raise UserError(
+            f"{options.folder}: expected emberlink eval {options.folder} METHOD [key=value ...] "
+            "--name NAME; METHOD says which observations it reads"
+        )
+    settings += [f"device={options.device}"] if options.device else []
+    policy, reference = open_policy(options.folder)
+    return new_run(reference, options.name, foreign_config(policy, method, settings)).path
 
 
 def evaluate_run(
@@ -60,7 +83,7 @@ def evaluate_run(
     *,
     checkpoint: Path,
     fires: int,
-    report: Callable[[str], None],
+    report: Callable[[str, str], None] = lambda *_: None,
     label: str = "",
     about: Sequence[str] = (),
 ) -> Results:
@@ -69,11 +92,10 @@ def evaluate_run(
     Args:
         checkpoint: file of the policy.
         fires: number of test fires, one episode each.
-        report: called with a line of text before each part of the work.
+        report: see `evaluate.evaluate`.
         label: suffix of the file names.
         about: texts that the title of the replay names, such as changed settings.
     """
-    count = f"{fires} fire{'s' * (fires > 1)}"
     with naming(run.path / "figures"):
         run.figures()  # an unusable folder is an error before the episodes, not after
     recorder = recorder_of(config, actor)
@@ -81,7 +103,7 @@ def evaluate_run(
         config,
         actor,
         fires=fires,
-        report=lambda fire, policy: report(f"{policy} on {count} of {fire}"),
+        report=report,
         watch=recorder.add,
     )
     shown = Episode(title=title_of(config, *about), recording=recorder.recording())
@@ -98,7 +120,7 @@ def evaluate_run(
         "seed": config.seed,
         "start_seed": evaluate.START_SEED,
         "checkpoint": checkpoint.name,
-        "step": read_header(checkpoint).step,
+        "step": 0 if checkpoint.name == FOREIGN else read_header(checkpoint).step,
         "fires": fires,
         "start_seeds": list(range(evaluate.START_SEED, evaluate.START_SEED + fires)),
         "held_out": {name: fires_of(scenarios[name]).describe(fires) for name in results},

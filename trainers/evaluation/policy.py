@@ -10,14 +10,17 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import TensorDictPrimer
 
 from emberlink.comm.base import MODULES
+from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
+from emberlink.policies.hold import held
 from emberlink.policies.state import primer_of
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.config.compose import differences, evaluated_with
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import parse
 from emberlink.trainers.evaluation.episodes import Panel, play_side_by_side, scripted, title_of
+from emberlink.trainers.evaluation.foreign import FOREIGN, ForeignPolicy, foreign_name, reopen
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.runs.checkpoint import load_weights, read_header
@@ -38,7 +41,7 @@ class TrainedPolicy(TensorDictSequential):
     Args:
         actor: the networks.
         config: configuration of the run.
-        checkpoint: file of the networks.
+        checkpoint: file of the networks, or `foreign.FOREIGN`.
         changes: settings that are not those of the training, such as `env.radio.range=0`.
     """
 
@@ -109,7 +112,8 @@ def load_policy(
     runs = sorted(str(file.parent) for file in folder.glob("*/config.yaml"))
     if runs and not (folder / "config.yaml").exists():
         raise UserError(f"{folder}: a folder of {len(runs)} runs; choose one: {', '.join(runs)}")
-    file = run.checkpoint() if checkpoint is None else checkpoint
+    name = foreign_name(run)
+    file = run.checkpoint() if checkpoint is None and not name else checkpoint
     trained = run.config(file, **({} if device is None else {"device": device}))
     given = {**dict(parse(text) for text in overrides), **(settings or {})}
     config = evaluated_with(trained, given)
@@ -120,7 +124,18 @@ def load_policy(
             f"{', '.join(fixed)}: an evaluation changes only keys of {', '.join(_CHANGEABLE)}"
         )
     changes = [*overrides, *(f"{key}={shown(value)}" for key, value in (settings or {}).items())]
+    if file is None:
+        actor = foreign_actor(reopen(run), name, config)
+        return TrainedPolicy(actor, config, folder / FOREIGN, [name, *changes])
     return TrainedPolicy(load_actor(config, file), config, file, changes)
+
+
+def foreign_actor(policy: Any, name: str, config: RunConfig) -> Any:
+    """Returns a policy that emberlink has not trained, deciding as often as `policy.hold` says."""
+    nowhere = torch.full(config.env.grid, torch.inf)
+    env = build_env(config, num_envs=1, fire=nowhere, seed=0, device=config.device)
+    actor = ForeignPolicy(policy, name, keys.observation_keys(env.observation_spec))
+    return held(actor, config.policy.hold, config.env.num_uavs)
 
 
 def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:

@@ -1,6 +1,6 @@
 """Defines the results of an evaluation, their means, and the table that is printed."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from rich.console import Console
@@ -44,11 +44,20 @@ def learned_means(results: Results) -> dict[str, float]:
     }
 
 
-def print_results(console: Console, results: Results, config: RunConfig) -> None:
+def reporter(console: Console) -> Callable[[str, str], None]:
+    """Returns a function that prints which policy flies over which fires."""
+    return lambda fire, policy: console.print(
+        f"  {policy} on the test fires of {fire}", style="dim", soft_wrap=True
+    )
+
+
+def print_results(console: Console, results: Results, config: RunConfig, policy: str = "") -> None:
     """Prints means over episodes: a table per fire, a row per policy, a column per measure.
 
-    Measures besides the paper's have a table of their own.
+    Measures besides the paper's have a table of their own. `policy` names the learned one, in place
+    of its method.
     """
+    called = policy or config.method
     for fire, by_policy in results.items():
         others = [name for name in by_policy[LEARNED] if name not in metrics.NAMES]
         episodes = len(by_policy[LEARNED]["coverage"])
@@ -61,7 +70,7 @@ def print_results(console: Console, results: Results, config: RunConfig) -> None
             for policy, measured in by_policy.items():
                 mean, learned = means(measured), policy == LEARNED
                 numbers = [_number(name, mean[name]) for name in measures]
-                name, style = (config.method, "bold") if learned else (policy, None)
+                name, style = (called, "bold") if learned else (policy, None)
                 table.add_row(name, *numbers, style=style)
             console.print(table)
 

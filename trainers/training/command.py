@@ -10,7 +10,7 @@ from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation.scores import print_results
+from emberlink.trainers.evaluation.scores import print_results, reporter
 from emberlink.trainers.terminal.progress import TrainingProgress
 from emberlink.trainers.terminal.signals import Interrupted, Interruption
 from emberlink.trainers.tracking import check_installed
@@ -35,9 +35,7 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
             if interruption.received:
                 raise Interrupted
             if not trainer.run.evaluated():
-                results = trainer.evaluate(
-                    lambda text: console.print(f"  {text}", style="dim", soft_wrap=True)
-                )
+                results = trainer.evaluate(reporter(console))
                 print_results(console, results, trainer.config)
                 console.print(str(trainer.run.path), soft_wrap=True)
     except KeyboardInterrupt:

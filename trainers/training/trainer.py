@@ -126,11 +126,11 @@ class Trainer:
             self.save()
         return setup.step == setup.total_steps
 
-    def evaluate(self, report: Callable[[str], None] = lambda _: None) -> Results:
+    def evaluate(self, report: Callable[[str, str], None] = lambda *_: None) -> Results:
         """Evaluates the frozen policy, writes eval.json and figures, and tells the tracker.
 
         Args:
-            report: called with a line of text before each part of the work.
+            report: called with the names of the fire and the policy before each evaluation.
         """
         config, run = self.config, self.run
         results = evaluate_run(

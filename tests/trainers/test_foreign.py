@@ -1,0 +1,259 @@
+"""Tests policies that emberlink has not trained, and those that it exports."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.modules import GRUModule
+
+import emberlink.trainers as trainers
+from emberlink.envs import keys
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.cli.main import main
+from emberlink.trainers.evaluation.export import Decision, export
+from emberlink.trainers.evaluation.foreign import FOREIGN, OnnxPolicy, new_run, open_policy, reopen
+from emberlink.trainers.evaluation.policy import load_policy
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.terminal.console import SafeConsole
+
+WORLD = {"setup": "tuned", "horizon": 20, "num_uavs": 3, "evaluation.scripted": []}
+SOURCE = """
+import numpy as np
+
+def rise(observation):
+    assert observation.shape[1:] == (3, 6)
+    return np.full((*observation.shape[:2], 3), [0.0, 0.0, 1.0])
+
+def turn(observation, state):
+    count = 0 if state is None else state + 1
+    return np.full((*observation.shape[:2], 3), (-1.0) ** count), count
+
+def fails(observation):
+    raise ValueError("no fuel")
+
+def shrinks(observation):
+    return observation[0, :, :3]
+"""
+
+
+@pytest.fixture
+def source(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(SOURCE)
+    return tmp_path
+
+
+def score(policy, method="independent", **more):
+    return trainers.evaluate(policy, method, episodes=2, **{**WORLD, **more})["huygens"]["learned"]
+
+
+def test_a_function_a_module_and_a_tensordict_module_fly_alike(source):
+    by_function = score("mine.py:rise")
+    linear = torch.nn.Linear(6, 3)
+    torch.nn.init.zeros_(linear.weight)
+    linear.bias.data = torch.tensor([0.0, 0.0, 1.0])
+    module = TensorDictModule(linear, in_keys=[keys.OBSERVATION], out_keys=[keys.ACTION])
+    assert score(linear) == score(module) == by_function
+    assert score("mine.py:rise", horizon=10) != by_function
+
+
+def test_state_begins_with_none_and_is_handed_on(source):
+    seen = []
+
+    def turns(observation, state):
+        seen.append(state)
+        count = 0 if state is None else state + 1
+        return np.full((*observation.shape[:2], 3), (-1.0) ** count), count
+
+    assert score(turns) == score("mine.py:turn")
+    assert seen == [None, *range(19)]
+
+
+def test_a_memory_of_torchrl_begins_empty():
+    states = []
+
+    class Watched(GRUModule):
+        def forward(self, tensordict):
+            states.append(tensordict.get("recurrent_state").clone())
+            return super().forward(tensordict)
+
+    name, flat = "features", torch.nn.Flatten(-2)
+    memory = Watched(
+        input_size=18, hidden_size=4, in_keys=[name, "recurrent_state"], out_keys=["h", ("next", "recurrent_state")]
+    )
+    policy = TensorDictSequential(
+        TensorDictModule(flat, in_keys=[keys.OBSERVATION], out_keys=[name]),
+        memory,
+        TensorDictModule(
+            torch.nn.Sequential(torch.nn.Linear(4, 9), torch.nn.Unflatten(-1, (3, 3))),
+            in_keys=["h"],
+            out_keys=[keys.ACTION],
+        ),
+    )
+    score(policy)
+    assert not states[0].any()
+    assert all(state.any() for state in states[1:])
+
+
+def test_a_dictionary_where_an_observation_has_several_tensors():
+    shapes = {}
+
+    def look(observation):
+        shapes.update({name: part.shape for name, part in observation.items()})
+        return np.zeros((50, 3, 3))
+
+    trainers.evaluate(
+        look, "independent", episodes=1, **{**WORLD, "observation": "window"}
+    )
+    assert shapes == {"observation": (50, 3, 6), "window": (50, 3, 3, 5, 5)}
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("mine.py:fails", r"mine: ValueError: no fuel \(.*mine.py:14\)"),
+        ("mine.py:shrinks", r"mine: .*\[3, 3\]; expected \[50, 3, 3\]"),
+        ("mine.py:rises", "'rises' is no function.*known: fails, rise"),
+        ("no.py:rise", "no.py:rise: FileNotFoundError"),
+        ("no.onnx", "no.onnx: there is no such file"),
+    ],
+)
+def test_a_policy_that_fails_is_one_line_with_its_name(source, name, message):
+    with pytest.raises(UserError, match=message) as error:
+        score(name, name="mine")
+    assert "\n" not in str(error.value)
+
+
+def test_a_scripted_policy_of_another_package_that_fails_leaves_the_others(monkeypatch):
+    from emberlink.policies.scripted.base import SCRIPTED, Scripted
+
+    class Broken(Scripted):
+        def forward(self, tensordict):
+            raise ValueError("no fuel")
+
+    Broken.__module__ = "elsewhere"
+    find = SCRIPTED.find
+    monkeypatch.setattr(SCRIPTED, "find", lambda name: Broken if name == "broken" else find(name))
+    names = ["broken", "stationary"]
+    with pytest.warns(UserWarning, match="broken: ValueError: no fuel"):
+        results = trainers.evaluate(
+            "pretrained:consensus", episodes=1, horizon=20, **{"evaluation.scripted": names}
+        )
+    assert set(results["huygens"]) == {"learned", "stationary"}
+
+
+def test_comparisons_and_replays_read_its_folder(source, capsys):
+    options = "setup=tuned env.horizon=20 env.num_uavs=3 evaluation.scripted=[] --fires 2".split()
+    for seed in (0, 1):
+        words = ["eval", "mine.py:turn", "independent", *options, f"seed={seed}", "--name", "turner"]
+        assert main(words) == 0
+    folders = sorted(Path("runs").iterdir())
+    table = trainers.compare("runs").ranking
+    assert set(table["label"]) == {"turner"}
+    assert table["seeds"].iloc[0] == [0, 1]
+    again = json.loads((folders[0] / "eval.json").read_text())["results"]
+    assert trainers.evaluate(folders[0], episodes=2)["huygens"] == again["huygens"]
+    assert main(["render", str(folders[0]), "--output", "replay.html"]) == 0
+    assert "turner" in Path("replay.html").read_text()
+
+
+def test_a_folder_that_names_code_inside_it_is_refused(source, tmp_path):
+    config = load_policy(RunFolder("runs/none") if False else _any_run(tmp_path)).config
+    for place in ("{run}/evil.py:act", "evil.py:act", "os:system", ""):
+        run = new_run("", "evil", config)
+        (run.path / "evil.py").write_text("raise SystemExit('ran')")
+        reference = place.format(run=run.path)
+        (run.path / FOREIGN).write_text(json.dumps({"name": "evil", "policy": reference}))
+        with pytest.raises(UserError, match="names no policy outside of its folder"):
+            reopen(run)
+
+
+def _any_run(tmp_path):
+    from emberlink.trainers.runs.pretrained import open_run
+
+    return open_run("pretrained:consensus", tmp_path)
+
+
+def exported(run, tmp_path):
+    """Exports a run, and returns its policy and the ONNX file's."""
+    export(str(run), tmp_path / "policy.onnx", SafeConsole(quiet=True))
+    return trainers.load(run), open_policy(str(tmp_path / "policy.onnx"))[0]
+
+
+def check_same_actions(policy, onnx: OnnxPolicy, steps: int, num_envs: int = 2, **changes):
+    """Checks that both act alike, within 1e-5, on the way that the policy flies."""
+    config = policy.config
+    env = trainers.make_env(config, num_envs=num_envs, seed=1, **changes)
+    decision, td, state = Decision(policy), env.reset(), None
+    for step in range(steps):
+        td = policy(td)
+        if step % config.policy.hold == 0:
+            action, state = onnx(td, state)
+            torch.testing.assert_close(action, td.get(keys.ACTION), atol=1e-5, rtol=0)
+        td = env.step_mdp(env.step(td))
+    assert decision.outputs[0] == "action"
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"policy.message": "attention", "share_parameters": True},
+        {"policy.message": "mean", "observation": "map", "share_parameters": True},
+        {"memory": "none", "share_parameters": False, "observation": "window"},
+    ],
+    ids=lambda settings: "-".join(map(str, settings.values())),
+)
+def test_an_onnx_file_acts_like_the_run(settings, tmp_path):
+    run = trainers.train(
+        "independent",
+        setup="strong",
+        output=str(tmp_path),
+        evaluate_after=False,
+        **{**TINY, **settings},
+    )
+    policy, onnx = exported(run.path, tmp_path)
+    check_same_actions(policy, onnx, 40)
+    if settings["share_parameters"]:
+        other = trainers.load(run.path, num_uavs=5)
+        check_same_actions(other, onnx, 20, num_envs=3)
+    card = json.loads((tmp_path / "policy.json").read_text())
+    assert card["method"] == "independent"
+    assert list(card["inputs"]) == list(onnx.inputs)
+    scored = trainers.evaluate(
+        str(tmp_path / "policy.onnx"), "independent", episodes=2, **{"evaluation.scripted": []}
+    )
+    torch.testing.assert_close(
+        torch.tensor(scored["huygens"]["learned"]["coverage"]),
+        torch.tensor(trainers.evaluate(run.path, episodes=2)["huygens"]["learned"]["coverage"]),
+        atol=1.0,
+        rtol=0,
+    )
+
+
+TINY = {
+    "episodes": 1,
+    "num_envs": 2,
+    "env.num_uavs": 3,
+    "env.horizon": 40,
+    "hidden": [8],
+    "units": 8,
+    "minibatches": 1,
+    "evaluation.interval": 0,
+    "evaluation.scripted": [],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(f"tuned/{method}" for method in ("consensus", "independent", "shared_memory", "positional")),
+        *(f"{setup}/{method}" for setup in ("strong", "strong_front") for method in ("consensus", "independent", "maps", "positional")),
+    ],
+)
+def test_pretrained_policies_as_onnx_files_act_alike_over_an_episode(name, tmp_path):
+    policy, onnx = exported(f"pretrained:{name}", tmp_path)
+    check_same_actions(policy, onnx, 1000)

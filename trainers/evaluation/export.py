@@ -1,0 +1,140 @@
+"""Writes the policy of a run as an ONNX file, with a card of what it reads and does."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torch.export import Dim
+
+from emberlink.envs import keys
+from emberlink.envs.utils.atomic_io import created, new_file
+from emberlink.envs.utils.errors import UserError
+from emberlink.policies.hold import Held
+from emberlink.trainers.build import make_env
+from emberlink.trainers.comparison.reading import read_evaluation
+from emberlink.trainers.comparison.tables import word
+from emberlink.trainers.config.compose import differences, resolve, to_values
+from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.values import flat
+from emberlink.trainers.evaluation.foreign import METADATA
+from emberlink.trainers.evaluation.policy import TrainedPolicy, load_policy
+from emberlink.trainers.evaluation.scores import LEARNED, means
+from emberlink.trainers.runs.checkpoint import read_header, versions
+from emberlink.trainers.runs.pretrained import read_run
+
+MEANING = {
+    "observation": "see env.observation_scale; the order of docs/environment.md",
+    "step": "steps since the episode began; where it is 0, the memory begins empty",
+    "memory": "next_memory of the decision before; 0 at the first",
+    "hears": "whether a UAV (row) hears another one (column) in this step",
+    "crops": "pictures of each UAV's own map, bytes",
+    "window": "cells around each UAV: new fire, old fire, no fire",
+    "action": "displacement along x, y and z in units of env.displacement cells, -1 to 1",
+    "next_memory": "memory of the next decision",
+}
+"""what an input or output holds"""
+
+
+class Decision(nn.Module):
+    """Maps the tensors that a policy reads at a decision to those that it writes."""
+
+    def __init__(self, policy: TrainedPolicy):
+        super().__init__()
+        self.policy: Any = policy.actor.policy if isinstance(policy.actor, Held) else policy.actor
+        self.reads, self.writes = list(self.policy.in_keys), list(self.policy.out_keys)
+        self.inputs = [key if isinstance(key, str) else key[-1] for key in self.reads]
+        self.outputs = ["next_" * (key[0] == "next") + key[-1] for key in self.writes]
+
+    def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        td = TensorDict({}, batch_size=tensors[0].shape[:1])
+        for key, tensor in zip(self.reads, tensors, strict=True):
+            td.set(key, tensor)
+        out = self.policy(td)
+        return tuple(out.get(key) for key in self.writes)
+
+
+def export(run: str, file: Path, console: Console) -> int:
+    """Runs `emberlink export`: writes FILE.onnx and FILE.json, and returns 0."""
+    path = new_file(file, (".onnx",))
+    card_path = new_file(file.with_suffix(".json"), (".json",))
+    try:
+        import onnxruntime  # noqa: F401
+        import onnxscript  # noqa: F401  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        needed = "pip install 'emberlink[export]'"
+        raise UserError(f"export needs {error.name}: {needed}") from None
+    policy = load_policy(read_run(run), device="cpu")
+    decision = Decision(policy)
+    example = observed(policy.config, decision, 3)
+    program: Any = torch.onnx.export(
+        decision.eval(),
+        example,
+        dynamo=True,
+        verbose=False,
+        input_names=decision.inputs,
+        output_names=decision.outputs,
+        dynamic_shapes=(tuple(_dynamic(policy.config, x) for x in example),),
+    )
+    card = card_of(policy, decision, example)
+    program.model.metadata_props[METADATA] = json.dumps(card)
+    with created(path) as partial:
+        program.save(partial)
+    with created(card_path) as partial:
+        partial.write_text(json.dumps(card, indent=1) + "\n")
+    for written in (path, card_path):
+        console.print(str(written), soft_wrap=True)
+    return 0
+
+
+def observed(config: RunConfig, decision: Decision, num_envs: int) -> tuple[Tensor, ...]:
+    """Returns what a policy reads at the first decision of an episode."""
+    env = make_env(config, num_envs=num_envs, fire=torch.full(config.env.grid, torch.inf), seed=0)
+    td = env.reset()
+    return tuple(td.get(key) for key in decision.reads)
+
+
+def _dynamic(config: RunConfig, tensor: Tensor) -> dict[int, Any]:
+    """Returns the dimensions that an ONNX file leaves open: environments and, if weights are
+    shared, UAVs."""
+    team, shared = config.env.num_uavs, config.learner.share_parameters
+    grows = shared and not config.policy.agent_index and config.comm["name"] != "positional"
+    return {
+        place: Dim.DYNAMIC
+        for place, size in enumerate(tensor.shape[:3])
+        if place == 0 or (grows and size == team and (place == 1 or tensor.dtype == torch.bool))
+    }
+
+
+def card_of(
+    policy: TrainedPolicy, decision: Decision, example: tuple[Tensor, ...]
+) -> dict[str, Any]:
+    """Returns what a user of an exported policy needs to know, as plain values."""
+    config, values = policy.config, flat(to_values(policy.config))
+    names = [f"{key}={values[key]}" for key in ("setup", "world")]
+    changed = differences(config, resolve(config.method, names))
+    own = [key for key in changed if key.startswith(("env.", "comm.", "policy."))]
+    file = policy.checkpoint.with_name("eval.json")
+    results = read_evaluation(file).results if file.exists() else {}
+    shapes = zip(decision.inputs, example, strict=True)
+    return {
+        "method": config.method,
+        "settings": [*names, *(f"{key}={word(values[key])}" for key in own)],
+        "decides_every": config.policy.hold,
+        "inputs": {
+            name: {
+                "shape": ["environments", *x.shape[1:]],
+                "dtype": str(x.dtype).removeprefix("torch."),
+                "meaning": MEANING.get(name, ""),
+            }
+            for name, x in shapes
+        },
+        "outputs": {name: MEANING.get(name, "") for name in decision.outputs},
+        "world": {key: word(value) for key, value in values.items() if key.startswith("env.")},
+        "checkpoint": {"file": policy.checkpoint.name, "step": read_header(policy.checkpoint).step},
+        "scores": {fire: means(policies[LEARNED]) for fire, policies in results.items()},
+        "versions": versions(),
+    }

@@ -1,0 +1,263 @@
+"""Opens policies that emberlink has not trained: a Python function or module, or an ONNX file."""
+
+import importlib
+import importlib.util
+import inspect
+import json
+import re
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules.utils import get_primers_from_module
+
+from emberlink.envs import keys
+from emberlink.envs.utils.errors import UserError, naming
+from emberlink.envs.utils.validation import shown
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.runs.run_folder import MAX_YAML, RunFolder, read_text
+
+METADATA = "emberlink"
+"""key of an ONNX file's metadata: what `emberlink export` says of the policy, as JSON"""
+FOREIGN = "policy.json"
+"""file of a run folder whose policy emberlink has not trained: its name, and where it is"""
+
+
+class ForeignPolicy(TensorDictModuleBase):
+    """Calls a policy with the observations of a team, and writes ("agents", "action").
+
+    Args:
+        policy: a TensorDictModule, an `nn.Module`, a function, or an `OnnxPolicy`. A function gets
+            an array [B, n, features] and returns actions [B, n, 3]; an `nn.Module` the same as
+            tensors. Where an observation has several tensors, they come as a dictionary by name.
+            With a second argument it gets its state of the decision before, None at the first, and
+            returns the action and the new state.
+        name: begins the message if the policy fails.
+        observed: keys of the observation, see `keys.observation_keys`.
+    """
+
+    def __init__(self, policy: Any, name: str, observed: list[Any]):
+        super().__init__()
+        self.policy, self.name, self.observed, self.state = policy, name, observed, None
+        reads: list[Any] = [*observed, keys.STEP]
+        writes: list[Any] = [keys.ACTION]
+        self.in_keys, self.out_keys = reads, writes
+        self._stateful = self._primer = None
+        if isinstance(policy, TensorDictModuleBase):
+            self._primer = get_primers_from_module(policy, warn=False)
+        else:
+            self._stateful = takes_state(policy)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        try:
+            with set_exploration_type(ExplorationType.DETERMINISTIC):
+                action = self._act(tensordict)
+        except UserError:
+            raise
+        except Exception as error:
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            told = " ".join(str(error).split())[:300]
+            raise UserError(
+                f"{self.name}: {type(error).__name__}: {told} ({last.filename}:{last.lineno})"
+            ) from error
+        expected = (*tensordict.get(keys.POSITION).shape[:-1], 3)
+        if tuple(action.shape) != expected:
+            raise UserError(
+                f"{self.name}: the actions have the shape {list(action.shape)}; expected "
+                f"{list(expected)}, [environments, UAVs, (x, y, z)]"
+            )
+        if not action.isfinite().all():
+            raise UserError(f"{self.name}: an action is NaN or infinite")
+        return tensordict.set(keys.ACTION, action)
+
+    def _act(self, tensordict: TensorDictBase) -> Tensor:
+        began = tensordict.get(keys.STEP) == 0
+        if isinstance(self.policy, TensorDictModuleBase):
+            if self._primer is not None:  # of TorchRL's memories, such as GRUModule
+                tensordict.set("is_init", began.unsqueeze(-1))
+                for key, spec in self._primer.primers.items(True, True) if began.all() else ():
+                    shape = (*tensordict.batch_size, *spec.shape)
+                    tensordict.set(key, torch.zeros(shape, dtype=spec.dtype, device=began.device))
+            return self.policy(tensordict).get(keys.ACTION)
+        if began.all():
+            self.state = None
+        if isinstance(self.policy, OnnxPolicy):
+            action, self.state = self.policy(tensordict, self.state)
+            return action
+        parts = {key[-1]: tensordict.get(key) for key in self.observed}
+        if not isinstance(self.policy, nn.Module):
+            parts = {name: part.cpu().numpy() for name, part in parts.items()}
+        observation = parts if len(parts) > 1 else next(iter(parts.values()))
+        if self._stateful:
+            action, self.state = self.policy(observation, self.state)
+        else:
+            action = self.policy(observation)
+        return torch.as_tensor(action).to(tensordict.get(keys.POSITION))
+
+
+class OnnxPolicy:
+    """Runs a decision of an ONNX file, such as `emberlink export` writes.
+
+    Inputs are named by the last part of their key; the output `next_X` is the next value of the
+    input X, which is 0 at first.
+    """
+
+    def __init__(self, file: Path):
+        try:
+            import onnxruntime
+        except ImportError:
+            raise UserError(f"{file}: needs onnxruntime: pip install 'emberlink[export]'") from None
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = torch.get_num_threads()
+        try:
+            self.session = onnxruntime.InferenceSession(str(file), options)
+        except Exception as error:  # onnxruntime has a class of its own for each
+            raise UserError(f"{file}: {' '.join(str(error).split())[:300]}") from None
+        self.inputs = {one.name: one for one in self.session.get_inputs()}
+        self.outputs = [one.name for one in self.session.get_outputs()]
+        if "action" not in self.outputs:
+            raise UserError(f"{file}: has no output 'action'; outputs: {', '.join(self.outputs)}")
+        text = self.session.get_modelmeta().custom_metadata_map.get(METADATA, "{}")
+        self.card: dict[str, Any] = json.loads(text)
+
+    def __call__(self, tensordict: TensorDictBase, state: Any) -> tuple[Tensor, Any]:
+        place, given = tensordict.get(keys.POSITION), {}
+        state = state or {}
+        for name, one in self.inputs.items():
+            key = name if name == keys.STEP else (keys.AGENTS, name)
+            if f"next_{name}" in self.outputs:
+                size = (*place.shape[:-1], one.shape[-1])
+                given[name] = state.get(name, np.zeros(size, np.float32))
+            elif (value := tensordict.get(cast(Any, key), None)) is not None:
+                given[name] = value.cpu().numpy()
+            else:
+                raise UserError(f"the policy reads {name!r}, which is not observed here")
+        out = dict(zip(self.outputs, self.session.run(None, given), strict=True))
+        after = {name.removeprefix("next_"): v for name, v in out.items() if name != "action"}
+        return torch.as_tensor(out["action"]).to(place), after
+
+
+def foreign_config(
+    policy: Any, method: str, overrides: Sequence[str] = (), **settings: Any
+) -> RunConfig:
+    """Returns the configuration of the environment that a policy flies in, see `resolve`.
+
+    An ONNX file of `emberlink export` chooses setup, world and hold, unless they are given.
+    """
+    card = policy.card if isinstance(policy, OnnxPolicy) else {}
+    return resolve(method, [*card.get("settings", ()), *overrides], **settings)
+
+
+def new_run(reference: str, name: str, config: RunConfig) -> RunFolder:
+    """Creates a run folder for a policy that emberlink has not trained.
+
+    Args:
+        reference: from `open_policy`, by which later commands open it; empty if they can't.
+        name: what comparisons call it.
+        config: of its environment.
+    """
+    stamp, plain = datetime.now().strftime("%Y-%m-%d_%H-%M-%S"), re.sub(r"[^\w.=+-]", "-", name)
+    label = f"{stamp}_{plain}_{config.setup}_{config.world}_s{config.seed}"
+    run = RunFolder.create(config, label)
+    run.write(FOREIGN, {"name": name, "policy": reference})
+    return run
+
+
+def foreign_name(run: RunFolder) -> str:
+    """Returns the name of a run's policy if emberlink has not trained it, else an empty text."""
+    return _read(run)["name"] if (run.path / FOREIGN).exists() else ""
+
+
+def reopen(run: RunFolder) -> Any:
+    """Returns the policy of a run that `new_run` has made.
+
+    A folder from somebody else must not name code that came with it, so only whole paths outside of
+    it are opened.
+    """
+    text = _read(run)["policy"]
+    file = Path(text if text.endswith(".onnx") else text.rpartition(":")[0])
+    if not file.is_absolute() or run.path.resolve() in file.resolve().parents:
+        raise UserError(f"{run.path / FOREIGN}: names no policy outside of its folder: {text!r}")
+    return open_policy(text)[0]
+
+
+def _read(run: RunFolder) -> dict[str, str]:
+    file = run.path / FOREIGN
+    with naming(file):
+        values = json.loads(read_text(file, MAX_YAML))
+        if not isinstance(values, dict) or not all(
+            isinstance(values.get(key), str) for key in ("name", "policy")
+        ):
+            raise UserError("expected the texts `name` and `policy`")
+    return values
+
+
+def is_reference(text: str) -> bool:
+    """Returns whether a text names a policy that emberlink has not trained."""
+    return text.endswith(".onnx") or bool(_split(text)[1])
+
+
+def open_policy(text: str) -> tuple[Any, str]:
+    """Returns the policy of `module:name`, `file.py:name` or `file.onnx`.
+
+    The second result is FILE:NAME or FILE.onnx with the whole path, by which it is opened again.
+
+    Raises:
+        UserError: there is no such file, module or name, or importing it fails.
+    """
+    if text.endswith(".onnx"):
+        if not (file := Path(text)).is_file():
+            raise UserError(f"{text}: there is no such file")
+        return OnnxPolicy(file), str(file.absolute())
+    place, name = _split(text)
+    try:
+        module = _module(place)
+    except Exception as error:
+        raise UserError(f"{text}: {type(error).__name__}: {error}") from error
+    if not callable(policy := getattr(module, name, None)) or inspect.isclass(policy):
+        known = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
+        raise UserError(
+            f"{text}: {shown(name)} is no function or module of {place}; known: {', '.join(known)}"
+        )
+    return policy, f"{Path(str(module.__file__)).absolute()}:{name}"
+
+
+def _split(text: str) -> tuple[str, str]:
+    """Returns the file or module and the name of `module:name`; an empty name if it is neither."""
+    place, _, name = text.rpartition(":")
+    is_module = all(part.isidentifier() for part in place.split("."))
+    return (place, name) if name.isidentifier() and (place[-3:] == ".py" or is_module) else ("", "")
+
+
+def _module(place: str) -> Any:
+    if not place.endswith(".py"):
+        sys.path.insert(0, "")  # modules of the working folder, as with python -m
+        try:
+            return importlib.import_module(place)
+        finally:
+            sys.path.remove("")
+    spec: Any = importlib.util.spec_from_file_location(Path(place).stem, place)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def takes_state(policy: Callable[..., Any]) -> bool:
+    """Returns whether a function, or the `forward` of a module, has a second argument."""
+    call = policy.forward if isinstance(policy, nn.Module) else policy
+    try:
+        parameters = inspect.signature(call).parameters.values()
+    except ValueError:  # of a function that is not written in Python
+        return False
+    by_place = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(one.kind in by_place for one in parameters) > 1
