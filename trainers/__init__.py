@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from emberlink.trainers.build import make_env
     from emberlink.trainers.config.compose import resolve
     from emberlink.trainers.config.schema import RunConfig
+    from emberlink.trainers.evaluation.export import export
     from emberlink.trainers.training.trainer import Trainer
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "UserError",
     "compare",
     "evaluate",
+    "export",
     "load",
     "make_env",
     "resolve",
@@ -34,6 +36,7 @@ __getattr__ = lazy(
         "build": "make_env",
         "config.compose": "resolve",
         "config.schema": "RunConfig",
+        "evaluation.export": "export",
         "training.trainer": "Trainer",
     },
 )

@@ -141,7 +141,9 @@ def add_export(commands: Any) -> None:
 def _export(options: argparse.Namespace, console: "Console") -> int:
     from emberlink.trainers.evaluation.export import export
 
-    return export(options.folder, options.file, console)
+    for written in export(options.folder, options.file):
+        console.print(str(written), soft_wrap=True)
+    return 0
 
 
 def add_compare(commands: Any) -> None:

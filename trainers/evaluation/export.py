@@ -1,22 +1,22 @@
 """Writes the policy of a run as an ONNX file, with a card of what it reads and does."""
 
 import json
+import logging
+import warnings
+from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.export import Dim
 
-from emberlink.envs import keys
 from emberlink.envs.utils.atomic_io import created, new_file
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import shown
 from emberlink.policies.hold import Held
 from emberlink.trainers.build import make_env
-from emberlink.trainers.comparison.reading import read_evaluation
-from emberlink.trainers.comparison.tables import word
 from emberlink.trainers.config.compose import differences, resolve, to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import flat
@@ -25,6 +25,7 @@ from emberlink.trainers.evaluation.policy import TrainedPolicy, load_policy
 from emberlink.trainers.evaluation.scores import LEARNED, means
 from emberlink.trainers.runs.checkpoint import read_header, versions
 from emberlink.trainers.runs.pretrained import read_run
+from emberlink.trainers.runs.run_folder import MAX_JSON, read_text
 
 MEANING = {
     "observation": "see env.observation_scale; the order of docs/environment.md",
@@ -57,37 +58,41 @@ class Decision(nn.Module):
         return tuple(out.get(key) for key in self.writes)
 
 
-def export(run: str, file: Path, console: Console) -> int:
-    """Runs `emberlink export`: writes FILE.onnx and FILE.json, and returns 0."""
-    path = new_file(file, (".onnx",))
-    card_path = new_file(file.with_suffix(".json"), (".json",))
+def export(run: str | PathLike[str], file: str | Path) -> tuple[Path, Path]:
+    """Writes the policy of a run as FILE.onnx, and a card as FILE.json; returns both.
+
+    Raises:
+        UserError: there is no such run, a file exists, or the extra `export` is not installed.
+    """
+    path = new_file(Path(file), (".onnx",))
+    card_path = new_file(path.with_suffix(".json"), (".json",))
     try:
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         needed = "pip install 'emberlink[export]'"
         raise UserError(f"export needs {error.name}: {needed}") from None
-    policy = load_policy(read_run(run), device="cpu")
+    policy = load_policy(read_run(fspath(run)), device="cpu")
     decision = Decision(policy)
     example = observed(policy.config, decision, 3)
-    program: Any = torch.onnx.export(
-        decision.eval(),
-        example,
-        dynamo=True,
-        verbose=False,
-        input_names=decision.inputs,
-        output_names=decision.outputs,
-        dynamic_shapes=(tuple(_dynamic(policy.config, x) for x in example),),
-    )
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # of operators of packages not used
+    with warnings.catch_warnings(action="ignore", category=FutureWarning):  # of torch's own code
+        program: Any = torch.onnx.export(
+            decision.eval(),
+            example,
+            dynamo=True,
+            verbose=False,
+            input_names=decision.inputs,
+            output_names=decision.outputs,
+            dynamic_shapes=(tuple(_dynamic(policy.config, x) for x in example),),
+        )
     card = card_of(policy, decision, example)
     program.model.metadata_props[METADATA] = json.dumps(card)
     with created(path) as partial:
         program.save(partial)
     with created(card_path) as partial:
         partial.write_text(json.dumps(card, indent=1) + "\n")
-    for written in (path, card_path):
-        console.print(str(written), soft_wrap=True)
-    return 0
+    return path, card_path
 
 
 def observed(config: RunConfig, decision: Decision, num_envs: int) -> tuple[Tensor, ...]:
@@ -118,11 +123,11 @@ def card_of(
     changed = differences(config, resolve(config.method, names))
     own = [key for key in changed if key.startswith(("env.", "comm.", "policy."))]
     file = policy.checkpoint.with_name("eval.json")
-    results = read_evaluation(file).results if file.exists() else {}
+    results = json.loads(read_text(file, MAX_JSON))["results"] if file.exists() else {}
     shapes = zip(decision.inputs, example, strict=True)
     return {
         "method": config.method,
-        "settings": [*names, *(f"{key}={word(values[key])}" for key in own)],
+        "settings": [*names, *(f"{key}={shown(values[key])}" for key in own)],
         "decides_every": config.policy.hold,
         "inputs": {
             name: {
@@ -133,7 +138,7 @@ def card_of(
             for name, x in shapes
         },
         "outputs": {name: MEANING.get(name, "") for name in decision.outputs},
-        "world": {key: word(value) for key, value in values.items() if key.startswith("env.")},
+        "world": {key: shown(value) for key, value in values.items() if key.startswith("env.")},
         "checkpoint": {"file": policy.checkpoint.name, "step": read_header(policy.checkpoint).step},
         "scores": {fire: means(policies[LEARNED]) for fire, policies in results.items()},
         "versions": versions(),

@@ -48,7 +48,8 @@ class ForeignPolicy(TensorDictModuleBase):
 
     def __init__(self, policy: Any, name: str, observed: list[Any]):
         super().__init__()
-        self.policy, self.name, self.observed, self.state = policy, name, observed, None
+        self.name, self.observed, self.state = name, observed, None
+        self.policy: Any = policy
         reads: list[Any] = [*observed, keys.STEP]
         writes: list[Any] = [keys.ACTION]
         self.in_keys, self.out_keys = reads, writes
@@ -85,7 +86,8 @@ class ForeignPolicy(TensorDictModuleBase):
         if isinstance(self.policy, TensorDictModuleBase):
             if self._primer is not None:  # of TorchRL's memories, such as GRUModule
                 tensordict.set("is_init", began.unsqueeze(-1))
-                for key, spec in self._primer.primers.items(True, True) if began.all() else ():
+                specs: Any = self._primer.primers
+                for key, spec in specs.items(True, True) if began.all() else ():
                     shape = (*tensordict.batch_size, *spec.shape)
                     tensordict.set(key, torch.zeros(shape, dtype=spec.dtype, device=began.device))
             return self.policy(tensordict).get(keys.ACTION)
