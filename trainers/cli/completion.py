@@ -39,7 +39,7 @@ def _words(prefix: str, action: argparse.Action, **_: Any) -> list[str]:
     name = str(action.metavar)
     if name.startswith("METHOD"):
         return config_files.known("method")
-    if name == "RUN":
+    if name.startswith("RUN"):
         folders = [path.rstrip("/") for path in glob.glob(f"{glob.escape(prefix)}*/")]
         shipped = Path(str(files("emberlink.policies"))) / "pretrained"
         paths = {file.parent.parent for file in shipped.glob("*/*/*/config.yaml")}

@@ -119,7 +119,7 @@ def differing(runs: Frame) -> Frame:
 
 def curves(runs: Frame) -> Frame:
     """Returns the interquartile mean over seeds, `iqm`, of each training episode of a section."""
-    parts = [pd.DataFrame(columns=["section", "label", "measure", "episode", "iqm", "low", "high"])]
+    parts: list[Frame] = []
     trained = runs[runs["as_trained"] & runs["object"].map(lambda run: len(run.lines) > 0)]
     for label, group in trained.groupby("label"):
         for measure in CURVES:
@@ -130,4 +130,8 @@ def curves(runs: Frame) -> Frame:
             numbers = {"iqm": bootstrap.iqm(values, 0), "low": low, "high": high}
             episode = np.arange(1, values.shape[1] + 1)
             parts.append(pd.DataFrame({**about, "episode": episode, **numbers}))
+    if not parts:  # no policy of the section was trained here
+        return pd.DataFrame(
+            columns=["section", "label", "measure", "episode", "iqm", "low", "high"]
+        )
     return pd.concat(parts, ignore_index=True)

@@ -25,6 +25,7 @@ from emberlink.envs.utils.errors import UserError, naming
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.runs.pretrained import is_name
 from emberlink.trainers.runs.run_folder import MAX_YAML, RunFolder, read_text
 
 METADATA = "emberlink"
@@ -206,7 +207,7 @@ def _read(run: RunFolder) -> dict[str, str]:
 
 def is_reference(text: str) -> bool:
     """Returns whether a text names a policy that emberlink has not trained."""
-    return text.endswith(".onnx") or bool(_split(text)[1])
+    return text.endswith(".onnx") or (not is_name(text) and bool(_split(text)[1]))
 
 
 def open_policy(text: str) -> tuple[Any, str]:
