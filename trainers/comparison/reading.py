@@ -54,6 +54,8 @@ class Evaluation:
     world: str = "paper"
     held_out: Settings = Field(default_factory=dict)
     """fire -> description of the held-out fires"""
+    message_fault: str = "none"
+    """`evaluation.message_fault`"""
     environment: Settings = Field(default_factory=dict)
     """settings of the environment"""
     communication: dict[str, Settings] = Field(default_factory=dict)
@@ -197,6 +199,8 @@ def evaluated_otherwise(run: Run, file: Path) -> list[Run]:
     now = flat({"world": evaluation.world, "env": evaluation.environment, "comm": learned})
     _check_types({**run.settings, **now}, file)
     changed = {key: value for key, value in now.items() if run.settings.get(key) != value}
+    if evaluation.message_fault != run.evaluation.message_fault:
+        changed["evaluation.message_fault"] = evaluation.message_fault
     names = ("world", "checkpoint", "step", "fires", "start_seed")
     apart = [n for n in names if getattr(evaluation, n) != getattr(run.evaluation, n)]
     apart += [key for key in ("env.horizon", "env.grid") if key in changed]

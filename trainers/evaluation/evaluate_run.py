@@ -129,6 +129,7 @@ def evaluate_run(
             name: config.comm if name == LEARNED else evaluate.scripted_config(config, name).comm
             for name in policies
         },
+        "message_fault": config.evaluation.message_fault,
         "device": config.device,
         "versions": versions(),
         "results": results,

@@ -234,6 +234,15 @@ def scripted(comparison, measure="coverage"):
     return dict(zip(ranking["label"], ranking["iqm"], strict=True))
 
 
+def test_evaluations_with_a_fault_of_messages_are_rows(tmp_path):
+    run = write_run(tmp_path, "independent", overrides=("learner=mappo", "policy.message=mean"))
+    content = read_evaluation(run) | {"message_fault": "zero"}
+    (run / "eval_evaluation.message_fault=zero.json").write_text(json.dumps(content))
+    (rows,) = labels(tmp_path).values()
+    named = "independent, evaluated with evaluation.message_fault=zero"
+    assert list(rows) == ["independent", named]
+
+
 def test_scripted_policies_have_rows_of_their_own(tmp_path):
     for seed in range(2):
         for method, run in ((m, write_run(tmp_path, m, seed)) for m in ("consensus", "positional")):

@@ -1,0 +1,120 @@
+"""Trains the arms of the study (docs/study.md) in its order.
+
+    python docs/experiments/study.py list OUTPUT           # prints the commands
+    python docs/experiments/study.py run OUTPUT            # runs them, and skips what is finished
+    python docs/experiments/study.py run OUTPUT front      # only those of some worlds
+
+Each training is one process with one thread; one that was stopped is resumed.
+`study_tables.py` makes the tables.
+"""
+
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+NEW = ["evaluation.huygens=false", "fire.test_seed=1500000"]
+WORLDS = {"front": [], "relay": ["env.reward.base=1.0"], "paper": NEW, "swarm": []}
+ALL = ["setup=strong", "env.reward.unseen=-0.03", "evaluation.scripted=[]"]
+OF_SWEEP = ["executor.workers=1", "executor.threads=1"]
+OF_VECTOR = ["learner.chunk=25", "episodes=240", "evaluation.interval=10"]
+OF_PICTURES = ["env.observation=map", "policy.memory=none", "learner.hidden=[64]"]
+OF_IMITATION = [
+    *("learner=imitation", "learner.updates_per_step=4", "learner.buffer_size=50000"),
+    *("learner.lr=1e-3", "num_envs=16", "episodes=8"),
+    *("evaluation.interval=8", "evaluation.episodes=1"),
+]
+OF_MAP = [
+    *("learner.gamma=0.95", "learner.gae_lambda=0.95", "learner.epochs=2", "learner.lr=5e-4"),
+    *("learner.log_std=-1.2", "num_envs=32", "episodes=40", "evaluation.interval=2"),
+]
+ATTENTION, UNLIMITED = "policy.message=attention", "env.radio.range=.inf"
+EXCHANGES: dict[str, tuple[str, Sequence[str]]] = {
+    "none": ("independent", []),
+    "attention": ("independent", [ATTENTION]),
+    "maps": ("maps", []),
+    "consensus": ("consensus", []),
+    "maps_unlimited": ("maps", [UNLIMITED]),
+    "attention_unlimited": ("independent", [ATTENTION, UNLIMITED]),
+    "positions": ("positional", []),
+    "mean": ("independent", ["policy.message=mean"]),
+    # As many bytes a step: a message and its key of 8 bytes are sent once in ten steps.
+    "maps_16": ("maps", ["env.radio.bandwidth=16"]),
+    "attention_16": ("independent", [ATTENTION, "policy.message_size=152"]),
+    "maps_64": ("maps", ["env.radio.bandwidth=64"]),
+    "attention_64": ("independent", [ATTENTION, "policy.message_size=632"]),
+}
+"""name -> method and settings: all in which arms with the same observation differ"""
+OF_WORLD = {
+    "vector": ("none", "attention"),
+    "map": ("none", "attention", "maps", "maps_unlimited"),
+}
+"""exchanges of the worlds other than `front`"""
+MOST = "none", "attention", "maps", "consensus"
+"""exchanges with 10 seeds in `front`; all others have 5"""
+
+
+def arms(world: str) -> list[tuple[str, str]]:
+    """Returns observation and exchange of each arm of a world."""
+    if world != "front":
+        return [(observed, name) for observed, names in OF_WORLD.items() for name in names]
+    of_vector = [n for n in EXCHANGES if not n.startswith("maps") and not n[-1].isdigit()]
+    return [*(("vector", name) for name in of_vector), *(("map", name) for name in EXCHANGES)]
+
+
+def settings(world: str, observed: str, name: str) -> list[str]:
+    """Returns the method and the settings of an arm, in imitation and afterwards."""
+    method, exchange = EXCHANGES[name]
+    shown = OF_PICTURES if observed == "map" else []
+    return [method, *ALL, f"world={world}", *WORLDS[world], *shown, *exchange]
+
+
+def commands(output: Path, world: str, observed: str, name: str) -> Iterator[list[str]]:
+    """Yields the commands of an arm; those that name a run are known once it has been trained."""
+    common, folder = settings(world, observed, name), output / world / f"{observed}_{name}"
+    count = 10 if world == "front" and name in MOST else 5
+    trained = common + (OF_VECTOR if observed == "vector" else OF_MAP)
+    for seed in range(count):
+        more = [f"seed={seed}", *OF_SWEEP]
+        if observed == "map":
+            first = output / world / f"imitation_{name}"
+            yield ["sweep", *common, *OF_IMITATION, *more, f"output={first}"]
+            more.append(f"learner.warm_start={_run(first, seed)}")
+        yield ["sweep", *trained, *more, f"output={folder}"]
+        for fault in ("zero", "shuffle") if "message" in str(common) else ():
+            run = _run(folder, seed)
+            if not (run / f"eval_evaluation.message_fault={fault}.json").exists():
+                yield ["eval", str(run), f"evaluation.message_fault={fault}"]
+
+
+def _run(folder: Path, seed: int) -> Path:
+    """Returns the run of a seed."""
+    return next(folder.glob(f"*_s{seed}_*"), folder / f"RUN_s{seed}")
+
+
+def main(verb: str, output: str, *worlds: str) -> int:
+    """Prints or runs all commands; returns how many failed."""
+    failed = 0
+    for world in worlds or WORLDS:
+        scripted = Path(output) / world / "scripted.json"
+        scripted.parent.mkdir(parents=True, exist_ok=True)
+        check = ["world", "check", world, "setup=strong", *WORLDS[world], "--json", str(scripted)]
+        of_arms = (line for arm in arms(world) for line in commands(Path(output), world, *arm))
+        if not scripted.exists() and world != "paper":
+            failed += _do(verb, check)
+        for line in of_arms:
+            failed += _do(verb, line)
+    return failed
+
+
+def _do(verb: str, line: Sequence[str]) -> int:
+    print("emberlink", shlex.join(line), flush=True)
+    if verb != "run":
+        return 0
+    program = [sys.executable, "-m", "emberlink.trainers.cli"]
+    return int(subprocess.run([*program, *line], check=False).returncode != 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))
