@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, label
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.files import library
@@ -42,14 +42,14 @@ class Perimeters(Fire):
         """Divides the time between two fronts by a sample's distances to both."""
         points, begun, idle = window.samples(), 0, 0
         burnt, times = np.zeros(points.grid, bool), np.full(points.grid, np.inf)
-        front: Any = cKDTree(np.empty((0, 2)))
+        front: Any = KDTree(np.empty((0, 2)))
         centres = np.stack(np.meshgrid(*points.axes(), indexing="ij"), -1)
         index = library("shapely").STRtree(library("shapely").points(centres.reshape(-1, 2)))
         for k, parts in enumerate(self.areas):
             after = burnt | _drawn(parts, points, index)
             new, last = after & ~burnt, front
             edge = _front(np.concatenate([last.data, _outline(parts, points.side)]), after, points)
-            front = cKDTree(edge, balanced_tree=False, compact_nodes=False)
+            front = KDTree(edge, balanced_tree=False, compact_nodes=False)
             labels: Any = label(new, EIGHT)
             beside: Any = binary_dilation(burnt, EIGHT)
             begun += labels[1] - len(np.unique(labels[0][new & beside]))
@@ -128,9 +128,13 @@ def read_perimeters(
         *report.facts,
     ]
     areas, burns = [_areas(shapes[values == time]) for time in at], (float(at[0]), float(at[-1]))
-    if clock.origin is None and at[0] > 0:  # a fire with elapsed times began at 0
-        if at[0] > at[-1] - at[0]:
-            report.doubts.append(f"it begins at time 0 (fire.start={at[0]:g}: at the first)")
+    # A fire with elapsed times began at 0.
+    if clock.origin is None and config.units != "day_of_year" and (config.start or 0) != at[0] > 0:
+        if config.start is None and at[0] > at[-1] - at[0]:
+            seen = f"its times begin at {first} and end at {last}"
+            raise ask(
+                seen, "fire.start=0 if it began at 0", f"fire.start={at[0]:g} if it began then"
+            )
         areas, at = [_at_zero(areas, at), *areas], np.concatenate([[0.0], at])
     return Perimeters(clock, *burns, float(at[0]), whole=False, areas=areas, at=at)
 

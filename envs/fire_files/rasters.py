@@ -191,9 +191,9 @@ def _band(
     if dataset.count != band:
         some = "a bank of fires, tagged units=steps"
         raise ask(f"{dataset.count} bands", "one", some, "maps of states with fire.kind=masks")
-    tags = {**dataset.tags(), **dataset.tags(band)}
-    titles = dataset.descriptions[band - 1], tags.get("long_name"), tags.get("NETCDF_VARNAME")
-    declared = (dataset.units[band - 1] or tags.get("units") or "").strip()
+    tags = {name.lower(): text for name, text in (dataset.tags() | dataset.tags(band)).items()}
+    titles = dataset.descriptions[band - 1], tags.get("long_name"), tags.get("netcdf_varname")
+    declared = (dataset.units[band - 1] or tags.get("units") or tags.get("unit") or "").strip()
     what = f"band {next((title for title in titles if title), band)!r:.60}"
     what += f", the last of {band} times" if band > 1 else ""
     what += f" ({declared})" if declared else ""

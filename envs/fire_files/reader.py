@@ -38,7 +38,7 @@ def read_with_summary(
     """Returns the fires of `read_fires` and the findings about the file; warns of a misreading."""
     check_grid(grid)
     fires, report = [], Report()
-    with _named(config.path) as path, quiet():
+    with _named(config.path, config.layer) as path, quiet():
         sources = _sources(path, config, horizon, report)
         for source in sources:
             try:
@@ -56,8 +56,8 @@ def read_with_summary(
 
 
 @contextmanager
-def _named(file: str) -> Iterator[Path]:
-    """Gives the path of a file, and names it in errors."""
+def _named(file: str, layer: str | None = None) -> Iterator[Path]:
+    """Gives the path of a file, and names it and its layer in errors."""
     path = user_path(file)
     try:
         yield path
@@ -65,7 +65,8 @@ def _named(file: str) -> Iterator[Path]:
         text = str(error).removeprefix(f"{path.name}: ")
         if not isinstance(error, UserError):
             text = f"cannot be read: {getattr(error, 'strerror', None) or 'not enough memory'}"
-        raise UserError(printable(f"{path}: {text}")) from None
+        place = f"{path}, layer {layer}" if layer else str(path)
+        raise UserError(printable(f"{place}: {text}")) from None
 
 
 def _sources(path: Path, config: FileFireConfig, horizon: int, report: Report) -> Sequence[Fire]:
@@ -92,18 +93,18 @@ class FireSets(NamedTuple):
 
 def fire_sets(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> FireSets:
     """Returns the fires from the run's copy if it has this grid and horizon, else from files."""
-    saved = _read_copy(config, grid, horizon)
-    if saved is not None:
+    if (saved := _read_copy(config, grid, horizon)) is not None:
         return saved
     if config.sha256 is not None:
         with_checksum(config)
     fires, about = read_with_summary(config, grid, horizon)
     train, validation, test = _divide(len(fires), test_file=config.test is not None)
-    if config.test is None:
-        return FireSets(fires[train], fires[validation], fires[test], about)
-    other = dataclasses.replace(config, path=config.test)
-    tests, more = read_with_summary(other, grid, horizon)
-    return FireSets(fires[train], fires[validation], tests, f"{about}; test fires: {more}")
+    tests = fires[test]
+    if config.test is not None:
+        other = dataclasses.replace(config, path=config.test)
+        tests, more = read_with_summary(other, grid, horizon)
+        about = f"{about}; test fires: {more}"
+    return FireSets(fires[train], fires[validation], tests, about)
 
 
 def _divide(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[int]]:
@@ -139,8 +140,7 @@ def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horiz
 
 def _key(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
     """Returns all values on which the fires depend."""
-    values = dataclasses.asdict(config)
-    del values["saved_copy"]
+    values = dataclasses.asdict(dataclasses.replace(config, saved_copy=None))
     return json.dumps([READER_VERSION, values, *grid, horizon])
 
 
@@ -150,15 +150,11 @@ def _read_copy(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> F
         return None
     most = 12 * MAX_BANK + 1_000_000  # bytes: float32 of the cells of all sets
     try:
-        with (
-            open_regular(Path(config.saved_copy), most) as file,
-            np.load(file, allow_pickle=False) as arrays,
-        ):
+        with open_regular(Path(config.saved_copy), most) as file, np.load(file) as arrays:
             size = sum(part.file_size for part in arrays.zip.filelist)
             if size > most or str(arrays["key"]) != _key(config, grid, horizon):
                 return None
             *fires, about = (arrays[name] for name in FireSets._fields)
-            train, validation, test = map(torch.from_numpy, fires)
-            return FireSets(train, validation, test, printable(str(about)))
+            return FireSets(*map(torch.from_numpy, fires), printable(str(about)))  # pyright: ignore
     except Exception:  # damage raises many types
         return None

@@ -104,16 +104,15 @@ def _by_gdal(path: Path, wanted: str | None) -> Any:
     pyogrio = library("pyogrio")
     names = [str(name) for name, kind in pyogrio.list_layers(path) if kind is not None]
     if wanted not in names and (wanted or len(names) != 1):
-        known = ", ".join(names[:30]) or "none"
-        raise ask(f"{len(names)} layers of perimeters", f"fire.layer, one of {known}")
+        keys = [as_argument("fire.layer", name) for name in names[:30]] or ["one"]
+        raise ask(f"{len(names)} layers of perimeters", *keys)
     return pyogrio.read_dataframe(path, layer=wanted or names[0], datetime_as_string=True)
 
 
 def _geojson(whole: Any) -> tuple[Any, list[str]]:
     """Reads GeoJSON; texts and numbers beside the features become columns, such as `valid_at`."""
-    single = whole.get("type") == "Feature"
-    features = [whole] if single else whole.get("features")
-    if not single and (whole.get("type") != "FeatureCollection" or not isinstance(features, list)):
+    features = [whole] if whole.get("type") == "Feature" else whole.get("features")
+    if whole.get("type") not in ("Feature", "FeatureCollection") or not isinstance(features, list):
         raise ask(f"type {str(whole.get('type'))[:40]!r}", "a FeatureCollection")
     crs: Any = _DEGREES
     if given := whole.get("crs"):
@@ -133,13 +132,13 @@ def _geojson(whole: Any) -> tuple[Any, list[str]]:
 
 def _shapes(geometries: Sequence[Any]) -> Sequence[Any]:
     """Returns geometries of GeoJSON; at once if all are polygons without holes, as circles are."""
-    shapely = library("shapely")
     kinds = {g["type"] + str(len(g.get("coordinates", ()))) if g else "" for g in geometries}
     if kinds != {"Polygon1"}:
         shape = library("shapely.geometry").shape
         return [shape(geometry) if geometry else None for geometry in geometries]
     rings = [np.array(geometry["coordinates"][0], float)[:, :2] for geometry in geometries]
     of = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
+    shapely = library("shapely")
     return shapely.polygons(shapely.linearrings(np.concatenate(rings), indices=of))
 
 

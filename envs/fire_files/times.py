@@ -5,6 +5,7 @@ Dates are read by strict patterns. If several fit, or several columns may hold t
 
 import contextlib
 import functools
+import itertools
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime, time, timedelta, timezone
@@ -16,23 +17,29 @@ from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.files import library
 from emberlink.envs.fire_files.report import Clock, Report, ask
 from emberlink.envs.fire_files.tables import FOLDERS, attributes, column_named, plain, texts
+from emberlink.envs.utils.validation import as_argument
 
 Times = tuple[np.ndarray, Clock]
 """A number for each feature, and its unit."""
 _ELAPSED = {
-    "minutes": "elapsed_mi elapsed_min elapsed_minutes minutes",
-    "seconds": "elapsed_s elapsed_sec elapsed_seconds seconds",
-    "hours": "elapsed_h elapsed_hours hours",
-    "days": "elapsed_days days",
+    "minutes": r"elapsedmi\w*|minutes",
+    "seconds": r"elapsedse?c?\w*|seconds",
+    "hours": r"elapsedho?\w*|hours",
+    "days": r"elapsedda\w*|days",
 }
 _MAPPED = (
-    "poly_polygondatetime polygondatetime perimeterdatetime perdatetime perdattime gdb_from_date "
-    "datetime date_time timestamp acq_datetime tutc valid_at acq_date date time t begin"
+    r"(poly)?polygond\w*|polypolyg|perimeterd\w*|perdat\w*|gdbfromdat\w*|datetime|timestamp|tutc"
+    r"|acqdat\w*|validat|date|time|t|begin"
 )
-_EDITED = "poly_datecurrent datecurrent"
-"""Columns of elapsed time; of the time when a perimeter was mapped; when a record was changed."""
+_EDITED = r"(poly)?datecur\w*|polydatec"
+"""Columns of elapsed time; of the time when a perimeter was mapped; when a record was changed.
+
+By the letters and digits of their names, also of those cut to ten letters, as in a .dbf.
+"""
 _HOUR, _MINUTE = r"(hours?|hora|heure|hr|h)", r"min(ute)?s?"
-_OF_DAY = rf"(.*)(time|{_HOUR}|uhr|hhmm|clock|ampm)(utc|gmt|z|local)?"
+_OF_DAY = rf"(.*?)(time|{_HOUR}|uhr|hhmm|clock|ampm)(utc|gmt|z|local)?"
+_OF_HOURS = rf".*?{_HOUR}(utc|gmt|z|local)?"
+_MIDNIGHT = r"[T ](00:00(:00)?([.]0+)?|12:00(:00)? AM)(Z|[+]00(:?00)?)?$"
 _DAYS = {
     **dict.fromkeys(("%Y-%m-%d", "%Y-%j", "%d-%b-%Y", "%d-%b-%y", "%b-%d-%Y"), ""),
     **dict.fromkeys(("%d-%m-%Y", "%d-%m-%y"), "day_first"),
@@ -56,8 +63,8 @@ _ZONES |= {"MST": -7, "MDT": -6, "PST": -8, "PDT": -7, "AKST": -9, "AKDT": -8}
 """Zones of RFC 2822 and of Alaska, hours."""
 _MONTH = r"(jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*\.?"
 _CLOCK = (
-    r"(?P<clock>\d\d?(?::\d\d){1,2}(?:[.,]\d+)?(?:\s?[ap]\.?m\.?)?|\d\d?\s?[ap]\.?m\.?"
-    r"|(?<=\d\d[\sT])\d{4}(?:\d\d)?)"
+    r"(?P<clock>\d\d?(?::\d\d){1,2}|(?<=\d\d[\sT])\d{4}(?:\d\d)?|\d\d?(?=\s?[ap]\.?m))"
+    r"(?:[.,]\d+)?(?:\s?(?P<half>[ap]\.?m\.?))?"
     rf"(?:\s?(?P<zone>{'|'.join(sorted(_ZONES, key=len, reverse=True))})\b)?"
     r"(?:\s?(?P<sign>[+-])(?P<hours>\d\d?)(?::?(?P<minutes>\d\d))?)?(?:\s?\([^)]*\))?"
 )
@@ -72,15 +79,23 @@ _WITHIN = (
 
 def read_times(frame: Any, config: FileFireConfig, outside: Sequence[str], report: Report) -> Times:
     """Returns the time of each feature; the values of columns `outside` stand beside the table."""
-    given = config.time_field
+    columns, given, whole = attributes(frame), config.time_field, frame
+    if "%" not in (config.time_format or ""):  # of names and descriptions, only the date in them
+        loose = [name for name in columns if name in (*outside, "Description")]
+        dated = {name: frame[name].astype(str).map(date_within).replace("", None) for name in loose}
+        frame = frame.assign(**dated)
     if given is None:
-        chosen = _candidates(frame, [n for n in attributes(frame) if n not in outside], config)
+        chosen = _candidates(frame, [name for name in columns if name not in outside])
+        chosen = chosen or _outside(frame, outside, config)
     else:
         given = (given,) if isinstance(given, str) else given
-        chosen = [column_named(name, attributes(frame), "fire.time_field") for name in given]
-    names = (*outside, "Description")
-    if not chosen or (chosen[0] in names and not _holds_dates(frame[chosen[0]])):
-        return _outside(frame, chosen or outside, config, report)
+        chosen = [column_named(name, columns, "fire.time_field") for name in given]
+    if not chosen:
+        columns = sorted(columns, key=lambda name: not _holds_dates(frame[name]))
+        seen = ", ".join(f"{name} ({str(whole[name].iloc[0])[:30]})" for name in columns[:15])
+        key = as_argument("fire.time_field", str(columns[0])) if columns else "a column of times"
+        some = f"{key} or such, and fire.time_format if its form is unusual"
+        raise ask(f"no column of times is known, of {seen or 'none'}", some)
     empty = frame.index[frame[chosen].isna().any(axis=1)]
     if len(empty):
         seen = f"{empty[0]} has no time in {chosen[0]} ({len(empty)} of {len(frame)})"
@@ -90,29 +105,31 @@ def read_times(frame: Any, config: FileFireConfig, outside: Sequence[str], repor
         numbers = library("pandas").to_numeric(written, errors="coerce")
         if numbers.notna().all() and not all(map(is_date, written.unique())):
             return _elapsed(chosen[0], numbers.astype(float), config, report)
-    read = _dates(written, config)
-    if len(chosen) == 1 and not has_clock(read):
+    if len(chosen) == 1 and not has_clock(_dates(written, config)):
         chosen += _clocks_beside(frame, chosen[0], asked=given is None)
-    if len(chosen) > 1:
-        read = [day + shift for day, shift in zip(read, _clocks(frame, chosen[1:]), strict=True)]
-    return _calendar(frame, read, " and ".join(map(str, chosen)), report)
+    return _calendar(frame, _dates(_joined(frame, chosen), config), chosen, report)
 
 
-def _known(names: str) -> set[str]:
-    """Returns the plain forms of names, also of those cut to ten letters, as in a .dbf."""
-    return {plain(part) for name in names.split() for part in (name, name[:10])}
+def _outside(frame: Any, outside: Sequence[str], config: FileFireConfig) -> list[str]:
+    """Returns the column that stands outside the features and holds dates; asks if two differ."""
+    found = [name for name in outside if frame[name].notna().all()]
+    dates = [_dates(texts(frame[name]), config) for name in found]
+    if any(other != dates[0] for other in dates):
+        seen = f"dates in {' and in '.join(found)} differ"
+        raise ask(seen, f"fire.time_field={found[0]} or such")
+    return found[:1]
 
 
-def _candidates(frame: Any, columns: Sequence[Any], config: FileFireConfig) -> list[Any]:
+def _candidates(frame: Any, columns: Sequence[Any]) -> list[Any]:
     """Returns the column with a known name; asks if several are left."""
     if "Folder" in frame and "TimeStamp" in columns and frame["TimeStamp"].notna().all():
         return ["TimeStamp"]  # of KML
     elapsed, mapped, edited = (
-        [n for n in columns if plain(n) in _known(names) and frame[n].notna().any()]
-        for names in (" ".join(_ELAPSED.values()), _MAPPED, _EDITED)
+        [n for n in columns if re.fullmatch(names, plain(n)) and frame[n].notna().any()]
+        for names in ("|".join(_ELAPSED.values()), _MAPPED, _EDITED)
     )
     dated = [name for name in mapped if _holds_dates(frame[name])]
-    timed = [name for name in dated if has_clock(_dates(texts(frame[name].dropna()), config))]
+    timed = [name for name in dated if texts(frame[name]).str.contains(r"\d[T ]\d|\d{10}").any()]
     elapsed = [name for name in elapsed if not dated or plain(name).startswith("elapsed")]
     found = elapsed or timed or dated or mapped or edited
     if len(found) > 1:
@@ -138,11 +155,11 @@ def _clocks_beside(frame: Any, date: Any, *, asked: bool) -> list[Any]:
     """Returns the columns of times of day that belong to a column of dates; asks if unsure."""
     columns, found, halves = attributes(frame), {}, []
     for name in columns:
-        values = texts(frame[name].dropna()).unique()
+        values = texts(frame[name].dropna())
         match = re.fullmatch(_OF_DAY, plain(name))
-        if len(values) and all(re.fullmatch(r"(?i)\s*[ap]\.?m\.?\s*", text) for text in values):
+        if len(values) and values.str.fullmatch(r"(?i)[ap]\.?m\.?").all():
             halves.append(name)
-        elif name != date and match and any(time_of_day(text) is not None for text in values):
+        elif name != date and match and values.str.match(r"\d{1,6}\b|\d\d?:\d\d").any():
             found[name] = match[1]
     stem = re.sub(r"(date|day|datum|fecha|data)", "", plain(date))
     paired = [name for name, rest in found.items() if rest == stem]
@@ -156,45 +173,27 @@ def _clocks_beside(frame: Any, date: Any, *, asked: bool) -> list[Any]:
     return []
 
 
-def _clocks(frame: Any, names: Sequence[Any]) -> list[timedelta]:
-    """Reads the times of day in columns of hours, minutes, HHMM, HH:MM, and AM or PM."""
+def _joined(frame: Any, names: Sequence[Any]) -> Any:
+    """Joins dates with times of day in columns of hours, minutes, HHMM, HH:MM, and AM or PM."""
     joined = texts(frame[names[0]])
-    for name in names[1:]:
-        minutes = re.fullmatch(rf".*{_MINUTE}", plain(name))
-        joined += texts(frame[name]).map(":{:>02}".format if minutes else " {}".format)
-    if re.fullmatch(rf".*{_HOUR}(utc|gmt|z|local)?", plain(names[0])):
-        joined = joined.str.replace(r"^(\d\d?)(?=$| )", r"\1:00", regex=True)
-    read = {text: time_of_day(text) for text in joined.unique()}
-    for text, shift in read.items():
-        if shift is None:
-            seen = f"{joined.index[joined == text][0]} has {' and '.join(map(str, names))}={text}"
-            raise ask(seen, "a time of day such as 2300, 23:00 or 11:00 PM")
-    return [read[text] or timedelta(0) for text in joined.tolist()]
+    joined = joined.str.replace(_MIDNIGHT, "", regex=True) if len(names) > 1 else joined
+    for place, name in enumerate(names[1:]):
+        part = texts(frame[name])
+        if re.fullmatch(_MINUTE, plain(name)):
+            joined = joined.str.replace(":00$", ":", regex=True) + part.str.zfill(2)
+            continue
+        digits, hours = part.str.isdecimal(), re.fullmatch(_OF_HOURS, plain(name)) is not None
+        short = digits & (part.str.len() < 3) & hours
+        part = part.mask(digits, part.str.zfill(4)).mask(short, part + ":00")
+        if place == 0:  # AM or PM alone begins a half of the day
+            part = part.str.replace(r"(?i)^(?=[ap]\.?m)", "12 ", regex=True)
+        joined += " " + part
+    return joined.rename(" and ".join(map(str, names)))
 
 
-def _outside(frame: Any, outside: Sequence[str], config: FileFireConfig, report: Report) -> Times:
-    """Reads the dates in names of placemarks, folders and files, or beside the features."""
-    found = {}
-    for name in outside:
-        written = [date_within(str(value)) for value in frame[name]]
-        if all(written):
-            found[name] = parse_dates(written, config.time_format, name)
-    first = next(iter(found), "")
-    if any(dates != found[first] for dates in found.values()):
-        raise ask(f"dates in {' and in '.join(found)} differ", f"fire.time_field={first} or such")
-    if found:
-        return _calendar(frame, found[first], first, report)
-    columns = [name for name in attributes(frame) if name not in outside]
-    columns = [name for name in columns if _holds_dates(frame[name])] or columns
-    if not columns:
-        raise ask("no attribute or name holds times", "perimeters with times")
-    seen = ", ".join(f"{name} ({str(frame[name].iloc[0])[:30]})" for name in columns[:15])
-    raise ask(f"no column of times is known, of {seen}", f"such as fire.time_field={columns[0]}")
-
-
-def _calendar(frame: Any, dates: Sequence[datetime], name: str, report: Report) -> Times:
+def _calendar(frame: Any, dates: Sequence[datetime], names: Sequence[Any], report: Report) -> Times:
     """Returns minutes since the first date."""
-    aware = [date.tzinfo is not None for date in dates]
+    aware, name = [date.tzinfo is not None for date in dates], " and ".join(map(str, names))
     if any(aware) and not all(aware):
         some, other = frame.index[aware.index(True)], frame.index[aware.index(False)]
         raise ask(f"{name}: {some} has a time zone and {other} has none", "one in all")
@@ -229,8 +228,9 @@ def _elapsed(name: Any, times: Any, config: FileFireConfig, report: Report) -> T
     wrong = times[~times.between(0, 1e12)]
     if len(wrong):
         raise ask(f"{wrong.index[0]} has {name}={wrong.iloc[0]:g}", "a time of 0 or more")
-    known = next((unit for unit, names in _ELAPSED.items() if plain(name) in _known(names)), None)
-    unit = decided_unit(known, config, f"{name} ({values.min():g} to {values.max():g})")
+    known = [unit for unit, names in _ELAPSED.items() if re.fullmatch(names, plain(name))]
+    about = f"{name} ({values.min():g} to {values.max():g})"
+    unit = decided_unit(known[0] if known else None, config, about)
     report.facts.append(f"times from {name}")
     if unit in ("days", "day_of_year"):
         values, unit = in_order(values, config), "days"
@@ -271,8 +271,7 @@ def parse_dates(texts: Sequence[str], form: str | None, key: str) -> list[dateti
         raise ask(f"fire.time_format={form}", ", ".join(known), "such as %d.%m.%Y")
     lengths = {len(text) if text.isdecimal() else 0 for text in texts}
     forms = _DIGITS.get(lengths.pop(), _ORDERS) if len(lengths) == 1 else _ORDERS
-    fits: dict[str, list[datetime]] = {}
-    text = ""
+    fits, text = {}, ""
     for name in (form,) if form else forms:
         with contextlib.suppress(ValueError, OverflowError, OSError):
             fits[name] = [_read((text := each).strip(), name) for each in texts]
@@ -323,53 +322,36 @@ def in_utc(date: datetime) -> datetime:
     return date.astimezone(UTC) if date.tzinfo else date.replace(tzinfo=UTC)
 
 
+@functools.lru_cache(1 << 16)
 def _read(text: str, form: str) -> datetime:
     """Reads a text by a pattern, or by the order of its day, month and year."""
     if form in _SINCE_1970:
         return datetime.fromtimestamp(float(text) / _SINCE_1970[form], UTC)
-    if len(text) in (8, 12, 14) and text.isdecimal() and "%" not in form:
-        form = _DIGITS[len(text)][0]
     if "%" in form:
         return datetime.strptime(text, form)
+    text = re.sub(r"^(\d{8})(\d{4}(?:\d\d)?)$", r"\1 \2", text)
     for written in _WRITTEN:
-        match = re.fullmatch(written, text, re.IGNORECASE)
-        if not match or not (day := _day(match["day"], form)):
+        if not (match := re.fullmatch(written, text, re.IGNORECASE)):
             continue
-        part = match.groupdict()
-        if part.get("clock") is None:
-            return day
-        if (shift := time_of_day(part["clock"])) is None:
-            break
-        away = timedelta(hours=_ZONES[part["zone"].upper()] if part["zone"] else 0)
-        beside = timedelta(hours=int(part["hours"] or 0), minutes=int(part["minutes"] or 0))
-        zone = timezone(away - beside if part["sign"] == "-" else away + beside)
-        return (day + shift).replace(tzinfo=zone if part["zone"] or part["sign"] else None)
+        part = dict.fromkeys(("clock", "half", "zone", "sign", "hours", "minutes"), "")
+        part |= match.groupdict("")
+        clock = re.sub(r"(?<!:)(\d\d)(?=\d)", r"\1:", part["clock"])
+        clock += part["half"].replace(".", "")
+        zone, hours = part["zone"], int(part["hours"] or 0) + int(part["minutes"] or 0) / 60
+        away = timedelta(hours=_ZONES[zone.upper()] if zone else 0)
+        away += timedelta(hours=-hours if part["sign"] == "-" else hours)
+        forms = itertools.product(_DAYS.items(), _CLOCKS if clock else ("",))
+        for (day, needs), clock_form in forms:
+            with contextlib.suppress(ValueError):
+                if needs in ("", form):
+                    date = datetime.strptime(f"{_day(part['day'])} {clock}", f"{day} {clock_form}")
+                    return date.replace(tzinfo=timezone(away) if zone or part["sign"] else None)
     raise ValueError(text)
 
 
-@functools.lru_cache(4096)
-def _day(text: str, order: str) -> datetime | None:
-    """Reads a day; None if no pattern fits."""
+def _day(text: str) -> str:
+    """Returns a day with - between its parts."""
     text = re.sub(r"^(\d{4})(?:(\d{3})|(\d\d)(\d\d))$", r"\1-\2\3-\4", text).rstrip("-")
     text = re.sub(r"(?<=\d)(st|nd|rd|th)\b", "", text, flags=re.IGNORECASE)
     text = re.sub(_MONTH, r"-\1-", text, flags=re.IGNORECASE)
-    text = re.sub(r"[-/.,\s]+", "-", text).strip("-")
-    for form, needs in _DAYS.items():
-        with contextlib.suppress(ValueError):
-            if needs in ("", order):
-                return datetime.strptime(text, form)
-    return None
-
-
-@functools.lru_cache(4096)
-def time_of_day(text: str) -> timedelta | None:
-    """Reads 2300, 155 (HHMM), 23:00, 1:55:00, 11:55 PM; AM or PM alone begin a half of the day."""
-    text = re.sub(r"(?<=:\d\d)[.,]\d+|[\s.]|(Z|UTC|GMT)$", "", text.strip(), flags=re.IGNORECASE)
-    text = re.sub(r"^(?=[ap]m$)", "12", text, flags=re.IGNORECASE)
-    text = re.sub(r"^(\d\d?)(\d\d)(?=[ap]m)", r"\1:\2", text, flags=re.IGNORECASE)
-    if text.isdecimal():
-        text = re.sub(r"(\d\d)(\d\d)(\d\d)?$", r"\1:\2:\3", text.zfill(4)).rstrip(":")
-    for form in _CLOCKS:
-        with contextlib.suppress(ValueError):
-            return datetime.strptime(text, form) - datetime(1900, 1, 1)
-    return None
+    return re.sub(r"[-/.,\s]+", "-", text).strip("-")

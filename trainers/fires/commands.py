@@ -35,14 +35,7 @@ from emberlink.trainers.fires.plot import arrival_figure
 def preview(arguments: Sequence[str], console: Console, output: Path | None = None) -> int:
     """Draws a fire, SCENARIO or FILE (and :INDEX) or `fire=NAME`, and prints its numbers."""
     path = new_file(output, [".png"]) if output is not None and not os.path.isdir(output) else None
-    sources, overrides = _divided(arguments)
-    names = [text.partition("=")[2] for text in overrides if text.startswith("fire=")]
-    keyed = [str(parse(text)[1]) for text in overrides if text.startswith("fire.path=")]
-    overrides = [text for text in overrides if not text.startswith(("fire=", "fire.path="))]
-    sources += [str(user_path(text)) for text in keyed] if names == ["file"] else names
-    if len(sources) != 1:
-        raise UserError(f"{shown(' '.join(sources))!r}: expected one scenario or file")
-    (text,) = sources
+    text, overrides = _source(arguments)
     name, _, index = text.rpartition(":") if ":" in text else (text, "", "0")
     name, index = (text, "0") if os.path.exists(text) else (name, index)
     known = name in scenarios()
@@ -61,8 +54,8 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
         arrival, title, stem = fires[int(index)], shown(Path(name).name), Path(name).stem
         title += f", fire {index} of {count}" if count > 1 else ""
     if path is None:
-        stem = f"fire_{stem}_{index}" if count > 1 else f"fire_{stem}"
-        free = free_name(output or Path(), re.sub(r"[^\w.+-]", "-", stem)[:100], [".png"])
+        stem = re.sub(r"[^\w.+-]", "-", f"fire_{stem}" + (f"_{index}" if count > 1 else ""))[:100]
+        free = free_name(output or Path(), stem, [".png"])
         path = free.with_name(f"{free.name}.png")
     times, width = arrival.numpy(), 2 * view_radius(world.altitude[1], world.view_angle)
     with created(path) as partial, warnings.catch_warnings():
@@ -73,6 +66,17 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
     about = [f"read: {read}"] if read else []
     _print(console, first, *about, *_growth(times, world, width), str(path))
     return 0
+
+
+def _source(arguments: Sequence[str]) -> tuple[str, list[str]]:
+    """Returns the only source, and the other keys; `fire=NAME` and `fire.path=` name one, too."""
+    sources, overrides = _divided(arguments)
+    names = [text.partition("=")[2] for text in overrides if text.startswith("fire=")]
+    keyed = [str(parse(text)[1]) for text in overrides if text.startswith("fire.path=")]
+    sources += [str(user_path(text)) for text in keyed] if names == ["file"] else names
+    if len(sources) != 1:
+        raise UserError(f"{shown(' '.join(sources))!r}: expected one scenario or file")
+    return sources[0], [text for text in overrides if not text.startswith(("fire=", "fire.path="))]
 
 
 def make(
@@ -145,26 +149,21 @@ def _growth(arrival: np.ndarray, world: Any, width: float) -> list[str]:
     in_view = min(end, world.num_uavs * width**2)
     steps = math.ceil(max(0.0, end - in_view) / uncovered)
     sides = " x ".join(map(_short, (world.num_uavs, width, world.displacement)))
-    rows = {
-        "burning at the start": f"{burning[0]} cells",
-        "burning at the end": f"{end} cells",
-        "growth, mean": f"{_short(mean)} cells/step",
-        "growth, maximum": f"{_short(most)} cells/step, steps {since} to {since + window}",
-        "a UAV flies": f"{_short(world.displacement)} cells/step",
-        "a UAV sees": f"{_short(width)} cells across, from full altitude",
-        "the team uncovers": f"{_short(uncovered)} cells/step at most: {sides}",
-    }
     ratio = f": {_short(uncovered / most)} times as many" if most > 0 else ""
-    checks = {
-        f"the team can uncover {_short(uncovered)} cells/step, {_short(most)} start to burn"
-        + ratio: most <= uncovered,
-        f"of {end} cells at the end {_short(in_view)} can be in view at once; uncovering others "
-        f"takes at least {steps} of {world.horizon} steps": steps <= world.horizon,
-    }
+    quick, enough = most <= uncovered, steps <= world.horizon
     return [
-        *(f"{name:21} {text}" for name, text in rows.items()),
-        f"UAVs can keep up: {'yes' if all(checks.values()) else 'no'}",
-        *(f"  {'+' if enough else '-'} {text}" for text, enough in checks.items()),
+        f"burning at the start  {burning[0]} cells",
+        f"burning at the end    {end} cells",
+        f"growth, mean          {_short(mean)} cells/step",
+        f"growth, maximum       {_short(most)} cells/step, steps {since} to {since + window}",
+        f"a UAV flies           {_short(world.displacement)} cells/step",
+        f"a UAV sees            {_short(width)} cells across, from full altitude",
+        f"the team uncovers     {_short(uncovered)} cells/step at most: {sides}",
+        f"UAVs can keep up: {'yes' if quick and enough else 'no'}",
+        f"  {'-+'[quick]} the team can uncover {_short(uncovered)} cells/step, "
+        f"{_short(most)} start to burn{ratio}",
+        f"  {'-+'[enough]} of {end} cells at the end {_short(in_view)} can be in view at once; "
+        f"uncovering others takes at least {steps} of {world.horizon} steps",
     ]
 
 

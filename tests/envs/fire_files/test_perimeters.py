@@ -63,7 +63,7 @@ def test_before_the_first_perimeter_by_hand(tmp_path):
     # The fire was a point three hours before the first perimeter, and stays one earlier.
     for first, width in ((180, 30), (360, 30)):
         squares(300, 400, Elapsed_Mi=[first, first + 60]).to_file(tmp_path / "late.shp")
-        late = read(tmp_path / "late.shp", (40, 40), first + 60, margin=0.0)
+        late = read(tmp_path / "late.shp", (40, 40), first + 60, margin=0.0, start=0.0)
         assert 1 <= (late == 0).sum() <= 4
         assert (late == 0)[19:21, 19:21].any()
         assert (late <= first).sum() == pytest.approx(width**2, abs=4 * width)
