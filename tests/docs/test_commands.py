@@ -69,6 +69,7 @@ def prepared(tmp_path_factory) -> Path:
             (folder / "mine" / name).write_text(content)
         blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[:count]
         (folder / f"{page}_block.py").write_text("\n".join(blocks))
+    (folder / "mine.py").write_text("def act(observation):\n    return observation[..., :3]\n")
     (folder / "blocks-1.dist-info").mkdir()
     (folder / "blocks-1.dist-info" / "METADATA").write_text("Name: blocks\nVersion: 1\n")
     (folder / "blocks-1.dist-info" / "entry_points.txt").write_text(ENTRY_POINTS)
@@ -113,7 +114,12 @@ def _train(rest: list[str]) -> list[str]:
 
 
 def _eval(rest: list[str]) -> list[str]:
-    return ["--fires", "1", *(["env.horizon=20"] if rest[0].startswith("pretrained") else [])]
+    is_run = rest[0].startswith("runs/")
+    return ["--fires", "1", *([] if is_run else ["env.horizon=20"])]
+
+
+def _tune(rest: list[str]) -> list[str]:
+    return ["episodes=1", "num_envs=2", "env.horizon=50", "evaluation.interval=1", "--trials", "1"]
 
 
 def _render(rest: list[str]) -> list[str]:
@@ -131,6 +137,7 @@ SHORT = {
     # Executors of clusters may not be installed.
     "sweep": lambda rest: [*(w for w in rest if not w.startswith("executor")), "--dry-run"],
     "eval": _eval,
+    "tune": _tune,
     "render": _render,
 }
 
@@ -157,6 +164,8 @@ LONG = re.compile(
 def test_a_command_of_the_documentation_runs(command, place):
     if "=BANK" in command:
         assert main(["fire", "import", "ArrivalTime.asc", "fire.units=minutes", *BANK]) == 0
+    if ".onnx independent" in command:
+        assert main(["export", "pretrained:strong/independent", "independent.onnx"]) == 0
     verb, *rest = shortened(shlex.split(command)[1:])
     if verb == "train" and "resume=" not in command:
         TrainingSetup(resolve(rest[0], rest[1:]))
@@ -169,4 +178,4 @@ def test_a_command_of_the_documentation_runs(command, place):
 
 def test_every_command_is_documented():
     verbs = {command.split()[1] for command in COMMANDS}
-    assert {*SHORT, "compare", "list", "doctor"} <= verbs
+    assert {*SHORT, "compare", "export", "list", "doctor"} <= verbs

@@ -273,6 +273,32 @@ def _sweep(options: argparse.Namespace, console: "Console") -> int:
     return sweep([*options.arguments, *jobs], console, dry=options.dry_run)
 
 
+def add_tune(commands: Any) -> None:
+    add = command(
+        commands,
+        "tune",
+        _tune,
+        "choose a method's settings by validation fires",
+        "Trains a method again and again with settings that Optuna chooses, stops trainings that "
+        "are below the median, and prints the best settings. Trials are runs in "
+        "output/tune_METHOD_SETUP_WORLD; the same command continues.",
+        "emberlink tune consensus setup=strong world=front --trials 20",
+    )
+    add("method", metavar="METHOD", help="a method, as for train")
+    _add_overrides(add, "keys as for train, which all trials have")
+    add("--trials", metavar="N", type=positive, default=20, help="number of trials (default: 20)")
+    what = "a YAML file of keys and values to try (default: that of the learner in configs/space)"
+    add("--space", metavar="FILE", type=path, help=what)
+
+
+def _tune(options: argparse.Namespace, console: "Console") -> int:
+    _check_names(options.method, options.overrides)
+    from emberlink.trainers.sweep.tune import tune
+
+    chosen = {"space": options.space, "trials": options.trials}
+    return tune(options.method, options.overrides, console, **chosen)
+
+
 def add_world(commands: Any) -> None:
     actions = command_group(
         commands,

@@ -96,7 +96,7 @@ def _parser() -> tuple[Parser, list[str]]:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for add in (
         *(of.add_train, of.add_eval, of.add_export, of.add_compare, of.add_render),
-        *(of.add_sweep, add_fire, of.add_world, add_list, of.add_doctor),
+        *(of.add_sweep, of.add_tune, add_fire, of.add_world, add_list, of.add_doctor),
     ):
         add(commands)
     return parser, list(commands.choices)

@@ -1,0 +1,140 @@
+"""Runs `emberlink tune`: chooses settings by validation fires, with Optuna."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.console import Console
+
+from emberlink.envs import metrics
+from emberlink.envs.utils import config_files
+from emberlink.envs.utils.atomic_io import read_bytes, user_path
+from emberlink.envs.utils.errors import UserError, naming
+from emberlink.envs.utils.validation import shown
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.runs.run_folder import MAX_YAML
+from emberlink.trainers.terminal.signals import Interruption
+from emberlink.trainers.training.resume import resume
+from emberlink.trainers.training.trainer import Progress, Trainer
+
+_RUN = "run"
+"""attribute of a trial: its run folder, in which an interrupted trial continues"""
+
+
+def tune(
+    method: str, overrides: Sequence[str], console: Console, *, space: Path | None, trials: int
+) -> int:
+    """Trains a method with settings that Optuna chooses, and prints the best ones.
+
+    A trial is a run, whose value is the headline measure of its last validation. A trial that is
+    below the median of the earlier ones at a validation is stopped. Test fires are not played. The
+    same command continues, in `output/tune_METHOD_SETUP_WORLD`.
+
+    Args:
+        method, overrides: see `resolve`.
+        space: a file with the settings to try; the learner's file of configs/space if None.
+        trials: number of trials, those of earlier commands included.
+
+    Returns:
+        0, or 128 and the number of the signal that ended it.
+    """
+    try:
+        import optuna
+        from optuna.storages import JournalStorage
+        from optuna.storages.journal import JournalFileBackend
+    except ImportError:
+        raise UserError("tune needs optuna: pip install 'emberlink[tune]'") from None
+    config = resolve(method, overrides)
+    if not config.evaluation.interval:
+        raise UserError("evaluation.interval=0: tune chooses by validations, and there are none")
+    ranges = _space(config, space)
+    headline, scores = config.evaluation.headline, metrics.HIGHER_IS_BETTER
+    folder = user_path(config.output) / f"tune_{method}_{config.setup}_{config.world}"
+    with naming(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    study = optuna.create_study(
+        storage=JournalStorage(JournalFileBackend(str(folder / "optuna.log"))),
+        study_name="emberlink",
+        direction="maximize" if headline in scores else "minimize",
+        sampler=optuna.samplers.TPESampler(seed=config.seed),
+        load_if_exists=True,
+    )
+    for old in study.get_trials(states=(optuna.trial.TrialState.RUNNING,)):
+        study.tell(old.number, state=optuna.trial.TrialState.FAIL)
+        study.enqueue_trial(old.params, user_attrs=old.user_attrs)
+    ended = optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED
+    while len(done := study.get_trials(states=ended)) < trials:
+        trial = study.ask()
+        chosen = [f"{key}={_suggest(trial, key, values)}" for key, values in ranges.items()]
+        trainer = _trainer(trial, method, [*overrides, *chosen, f"output={folder}"])
+        pruned = False
+
+        def report(state: Progress, trial: Any = trial, trainer: Trainer = trainer) -> None:
+            nonlocal pruned
+            value = _value(state.line, headline)
+            if value is not None and not state.step % config.env.horizon:
+                trial.report(value, state.episode)
+                if pruned := bool(trial.should_prune()):
+                    trainer.stop()
+
+        interruption = Interruption(trainer.stop)
+        try:
+            with interruption:
+                trainer.train(report)
+        finally:
+            trainer.close()
+        if interruption.received:
+            console.print("stopped; the same command continues", soft_wrap=True)
+            return interruption.status
+        value = _value(trainer.run.metrics()[-1], headline)
+        if pruned:
+            study.tell(trial, state=optuna.trial.TrialState.PRUNED)
+        else:
+            study.tell(trial, value)
+        text = f"trial {len(done) + 1} of {trials}: {' '.join(chosen)}: {headline} {value:.1f}"
+        console.print(text + ", stopped early" * pruned, soft_wrap=True, highlight=False)
+    best = study.best_trial
+    settings = " ".join([*overrides, *(f"{key}={value}" for key, value in best.params.items())])
+    line = f"best: {headline} {best.value:.1f}: emberlink train {method} {settings}"
+    console.print(line, soft_wrap=True, highlight=False)
+    return 0
+
+
+def _space(config: RunConfig, file: Path | None) -> dict[str, Any]:
+    """Returns the settings to try: key -> values, or low and high."""
+    file = file or config_files.find("space", config.learner.name)
+    with naming(file, yaml.YAMLError):
+        ranges = yaml.safe_load(read_bytes(file, MAX_YAML))
+        for key, values in ranges.items() if isinstance(ranges, Mapping) else [("", None)]:
+            known = isinstance(values, Mapping) and {"low", "high"} <= values.keys()
+            if not known and not (isinstance(values, list) and values):
+                raise UserError(f"{key}: {shown(values)}: expected a list, or low and high")
+    return dict(ranges)
+
+
+def _suggest(trial: Any, key: str, values: Any) -> Any:
+    """Returns the value of a setting in a trial."""
+    if isinstance(values, list):
+        return trial.suggest_categorical(key, values)
+    low, high = values["low"], values["high"]
+    whole = isinstance(low, int) and isinstance(high, int)
+    draw = trial.suggest_int if whole else trial.suggest_float
+    return draw(key, low, high, log=bool(values.get("log")))
+
+
+def _trainer(trial: Any, method: str, overrides: Sequence[str]) -> Trainer:
+    """Returns the training of a trial: a new one, or the one that was interrupted."""
+    if run := trial.user_attrs.get(_RUN):
+        return resume(run)
+    trainer = Trainer(resolve(method, overrides))
+    trial.set_user_attr(_RUN, str(trainer.start().path))
+    return trainer
+
+
+def _value(line: Mapping[str, Any], headline: str) -> float | None:
+    """Returns the mean of a headline over the sets of validation fires, if a line has any."""
+    values = [value for key, value in line.items() if key.endswith(f"/{headline}")]
+    return sum(values) / len(values) if values else None
