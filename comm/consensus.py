@@ -59,7 +59,7 @@ class ConsensusConfig:
 
 
 class TimeSteps(NamedTuple):
-    """What the module reads of successive time steps, [steps, num_envs, ...]; see `keys`."""
+    """The read entries of successive time steps, [steps, num_envs, ...]; see `keys`."""
 
     position: Tensor
     hears: Tensor

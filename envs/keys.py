@@ -81,8 +81,8 @@ TRUE_MAP: Final = "true_map"
 """uint8 [num_envs, X, Y]: `WildfireEnv.fire_map`. Only with `true_map=True`; no UAV knows it."""
 
 STEPS: Final = "steps"
-"""The steps of a held action, batch size [num_envs, hold]: what the measures of an episode need of
-each (`metrics.counted`), under the same keys. Only after a step with `hold` above 1."""
+"""The steps of a held action, batch size [num_envs, hold]: the entries that the measures read of
+each step (`metrics.counted`), under the same keys. Only after a step with `hold` above 1."""
 
 TEACHER: Final = (AGENTS, "teacher")
 """float32 [..., 3]: the action of a teacher with the UAV's own belief map; 0 at steps without a

@@ -178,7 +178,7 @@ def base_coverage_auc(seen: Tensor, burnt: Tensor) -> Tensor:
 
 
 def base_age(ages: Tensor) -> Tensor:
-    """Returns `front_age` of what the base knows.
+    """Returns `front_age` by the sightings that have reached the base.
 
     Args:
         ages: `keys.BASE_AGE` after each step, [..., T].
@@ -236,11 +236,11 @@ _COUNTED = (
     keys.HIT_BOUNDARY,
 )
 _AT_THE_END = (keys.FRONT_AGE, keys.FRONT_AGE_P95, keys.BASE_AGE)
-"""the keys of which `episode_metrics` reads the last step; only some worlds have them"""
+"""keys whose last step `episode_metrics` reads; only some worlds have them"""
 
 
 def counted(world: WildfireConfig) -> tuple[Any, ...]:
-    """Returns the keys of which it reads every step, beside `keys.BYTES_SENT`."""
+    """Returns the keys whose every step `episode_metrics` reads, beside `keys.BYTES_SENT`."""
     return _COUNTED if world.base is None else (*_COUNTED, keys.BASE_SEEN)
 
 

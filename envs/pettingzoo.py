@@ -328,7 +328,7 @@ def to_action(action: Any, size: int, agent: str = "the team") -> Array:
 
 
 def observation_space(env: EnvBase, config: WildfireConfig) -> tuple[Box, Space]:
-    """Returns the space of the vector of an observation, and that of the whole observation."""
+    """Returns the space of an observation's vector, and of the whole observation."""
     low, high = _bounds(config, env.observation_spec[keys.OBSERVATION].shape[-1])
     vector = Box(low, high, dtype=np.float32)
     _, *others = keys.observation_keys(env.observation_spec)

@@ -73,7 +73,7 @@ def train(
 
     Args:
         method, setup, world: names that `emberlink list` shows, or of files of your own.
-        fire, learner: the same; those of the setup or the world if None.
+        fire, learner: the same; the setup's or the world's if None.
         progress: called after each decision of the team; an exception in it ends the training.
         evaluate_after: whether to evaluate at the end, as `emberlink eval` does.
         settings: other settings, by the last part of their key (`episodes=5`, `horizon=50`) or the
@@ -138,7 +138,7 @@ def evaluate(
         checkpoint, device, settings: see `load`.
         episodes: number of episodes, each on another fire; if None, the run's
             `evaluation.episodes`.
-        scripted: whether to evaluate the scripted policies, too.
+        scripted: whether to evaluate the scripted policies as well.
         progress: called with the names of the fire and the policy before each evaluation.
 
     Returns:
@@ -185,7 +185,7 @@ def load(
     Args:
         run: a run folder, or `pretrained:METHOD`.
         checkpoint: file of networks; the newest of the run if None.
-        device: device of the networks; that of the run if None.
+        device: device of the networks; the run's if None.
         settings: `world`, settings of its fire (`"fire.path"`), or settings of `env`, `comm` or
             `evaluation` to change, as for `train`; the networks must fit.
 
@@ -208,7 +208,7 @@ def compare(
         paths: run folders, folders of run folders, or `pretrained:SETUP`.
         output: a new or empty folder for compare.html and compare.json; if None, no file is
             written.
-        labels: a name for the runs of each path, in place of their method.
+        labels: a name for the runs of each path, instead of their method.
 
     Returns:
         Tables of the runs, rankings with intervals, the gain of messages and the paper's claims.

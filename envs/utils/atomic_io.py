@@ -41,7 +41,7 @@ def open_regular(path: Path, max_bytes: int) -> BinaryIO:
 
 
 def read_bytes(path: Path, max_bytes: int) -> bytes:
-    """Returns the content of a regular file; errors are those of `open_regular`."""
+    """Returns the content of a regular file; raises the errors of `open_regular`."""
     with open_regular(path, max_bytes) as file:
         return file.read(max_bytes)
 

@@ -1,4 +1,4 @@
-"""Finds classes by name: those in a folder of emberlink, and entry points of other packages."""
+"""Finds classes by name: in a folder of emberlink, and by entry points of other packages."""
 
 import ast
 import re

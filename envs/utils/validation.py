@@ -28,10 +28,10 @@ CountOrZero = Annotated[int, Field(ge=0)]
 
 
 def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -> T:
-    """Returns a pydantic dataclass of plain values, such as those of a YAML file.
+    """Returns a pydantic dataclass of plain values, such as the content of a YAML file.
 
-    Unknown keys are errors, and no value is converted to another type. `key` is that of the values
-    in the whole configuration, for messages.
+    Unknown keys are errors, and no value is converted to another type. `key` is the place of
+    the values in the whole configuration, for messages.
     """
     # From JSON, strict validation accepts lists as tuples and mappings as dataclasses.
     try:
@@ -47,7 +47,7 @@ def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -
 def describe(error: ValidationError, prefix: str = "") -> str:
     """Describes the first error in one line: key, which begins with `prefix`, value and reason."""
     errors = error.errors()
-    # A mistyped key is reported as missing, too.
+    # A mistyped key is also reported as missing.
     mistyped = [entry for entry in errors if entry["type"] == "unexpected_keyword_argument"]
     first = (mistyped or errors)[0]
     parts = [str(part) for part in first["loc"] if not str(part).startswith(TAG)]

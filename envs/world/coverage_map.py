@@ -158,7 +158,7 @@ def mark(maps: Tensor, cells: Tensor, flags: Tensor) -> None:
 
 
 class Look(NamedTuple):
-    """What the UAVs see at successive steps; batch shape [steps, envs, uavs]."""
+    """The sightings of the UAVs at successive steps; batch shape [steps, envs, uavs]."""
 
     team: Sighting
     """the cells in view by class, new fire as new to the team"""
@@ -189,7 +189,7 @@ class CoverageMap(nn.Module):
         horizon: steps of an episode.
         envs: number of environments.
         uavs: UAVs per environment.
-        own: whether each UAV is shown as old fire what it has seen itself, and not what any has.
+        own: whether old fire, as shown to a UAV, is fire that it has seen itself, not that any has.
     """
 
     _fires: Tensor
@@ -206,7 +206,7 @@ class CoverageMap(nn.Module):
     seen_count: Tensor
     """int64 [envs]: cells that a UAV has seen while they burned"""
     seen_gone: Tensor
-    """int64 [envs]: those of them that have burnt out"""
+    """int64 [envs]: number of seen cells that have burnt out"""
 
     def __init__(
         self,

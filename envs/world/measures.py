@@ -45,7 +45,7 @@ class SightingAges(nn.Module):
     waiting: Tensor
     """int64 [envs, steps]: number of them by `since`"""
     edges: Tensor
-    """int64 [envs, ages]: number of runs that began at an age, less those that ended before it"""
+    """int64 [envs, ages]: runs that began at an age, less the runs that ended before it"""
     total: Tensor
     """int64 [envs]: sum of all ages"""
     count: Tensor
@@ -75,7 +75,7 @@ class SightingAges(nn.Module):
         for record, at in (
             (self.waiting, 0),
             (self.edges, 1),
-        ):  # the first ages are those of step 1
+        ):  # ages begin at step 1
             record.masked_fill_(began, 0)
             record[:, at] = torch.where(mask, first, record[:, at])
 
@@ -262,7 +262,7 @@ class Measures(nn.Module):
     def _report(
         self, view: View, step: Tensor, hears: Tensor, ignited: Tensor, ended: Cells
     ) -> Tensor:
-        """Adds a step of what the base knows; returns the burnt cells that it is told."""
+        """Adds a step to the base's knowledge; returns the burnt cells that it is told."""
         knowledge, ages = self.knowledge, self.base_ages
         assert knowledge is not None
         assert ages is not None

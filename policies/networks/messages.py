@@ -1,4 +1,4 @@
-"""Messages that are learned: what UAVs say, and how a UAV joins what it hears.
+"""Messages that are learned: how UAVs make them, and how a UAV joins the messages that it hears.
 
 At a decision, each UAV makes a message from its features; the UAVs that hear it by the radio of the
 world read the message at the same decision. Numbers are rounded to 8 bits, with the gradient of the
@@ -57,7 +57,7 @@ class Messages(nn.Module):
     def arrive(self, said: Tensor) -> Tensor:
         """Returns numbers that UAVs say, [envs, uavs, numbers], as others hear them: see `fault`.
 
-        Shuffled numbers are those of UAV i - 1 of environment e - 1, counted cyclically.
+        Shuffled, UAV i of environment e has the numbers of UAV i - 1 of environment e - 1.
         """
         if self.fault == "zero":
             return torch.zeros_like(said)

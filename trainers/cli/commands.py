@@ -1,4 +1,4 @@
-"""Defines the commands and their arguments, but those of `fire` and `list`.
+"""Defines the commands and their arguments, except `fire` and `list`.
 
 Their code is imported when they run, so that `emberlink --help` does not import torch.
 """

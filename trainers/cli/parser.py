@@ -13,7 +13,7 @@ from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.utils.errors import UserError, one_line
 
 MOST_FIRES = 65_536
-"""largest number of fires of an evaluation; that of `config.schema`, which imports torch"""
+"""largest number of fires of an evaluation: `config.basics.MAX_FIRES`, without its imports"""
 
 
 class _Help(argparse.HelpFormatter):

@@ -17,8 +17,8 @@ from emberlink.trainers.evaluation.scores import LEARNED
 SCRIPTED = ("map_greedy", "courier")
 """scripted policies whose value of communication is computed"""
 _SAME = {"map_greedy": ("map_greedy_alone", "map_greedy_all")}
-"""scripted policy -> the one that acts like it with the radio off, and the one without limits; in
-worlds without a base"""
+"""scripted policy -> the policies that act like it with the radio off and without limits, in worlds
+without a base"""
 _OF_LEARNERS = ("env.reward.", "env.observation", "env.measures")
 """beginnings of the keys of `env` that do not change what scripted policies do"""
 _OFF, _FULL = (0.0, None, None), (float("inf"), None, None)
@@ -99,7 +99,7 @@ def _radio(run: Run) -> tuple[float, Any, Any]:
 
 
 def heeded(run: Run) -> tuple[float, Any, Any]:
-    """Returns the radio of a run's evaluation as far as scripted policies heed it."""
+    """Returns the radio of an evaluation without the bandwidth, for scripted policies."""
     return (*_radio(run)[:2], None)
 
 

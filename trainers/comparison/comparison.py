@@ -159,7 +159,7 @@ def compare_runs(paths: Sequence[Path], labels: Sequence[str] = ()) -> Compariso
 
     Args:
         paths: run folders, folders of run folders, or names such as `pretrained:tuned`.
-        labels: a name for the runs of each path, in place of their method.
+        labels: a name for the runs of each path, instead of their method.
     """
     if not paths:
         raise UserError("nothing to compare: expected at least one run folder")

@@ -231,7 +231,7 @@ def _chapter(
     folder: Path,
     saved: Callable[[Figure, str, str], Picture],
 ) -> dict[str, Any]:
-    """Draws the figures of a section, and returns what the page shows of it."""
+    """Draws the figures of a section, and returns its part of the page."""
     runs, ranking, curves = (
         table[table["section"] == section]
         for table in (comparison.runs, comparison.ranking, comparison.curves)

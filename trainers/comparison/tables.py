@@ -81,7 +81,7 @@ def _row(run: Run) -> dict[str, Any]:
 def trained_with(run: Run) -> dict[str, str]:
     """Returns the settings that affect training, as on the command line, but not the seed's."""
     settings = {k: word(v) for k, v in run.settings.items() if k.split(".")[0] not in NOT_COMPARED}
-    if start := settings.get(WARM_START):  # each seed has a start of its own
+    if start := settings.get(WARM_START):  # each seed has another start
         settings[WARM_START] = without_time_and_seed(start)
     return settings
 
@@ -156,7 +156,7 @@ def _same_fires(first: Run, other: Run) -> bool:
 def means_table(runs: Frame) -> Frame:
     """Returns one row per run, set of fires, policy and measure.
 
-    Columns: those of `runs_table` up to seed, `values` (one per fire), `value` (their mean).
+    Columns: the first of `runs_table`, up to seed; `values` (one per fire); `value` (their mean).
     """
     columns = list(runs.columns[: runs.columns.get_loc("seed") + 1])
     rows = [

@@ -32,7 +32,7 @@ class Basics:
     env: WildfireConfig
     """settings of the environment"""
     policy: PolicyConfig = PolicyConfig()
-    """what the policies remember, and how often they decide"""
+    """memory of the policies, and time between their decisions"""
     episodes: Count
     """training episodes of each environment"""
     num_envs: Many

@@ -32,7 +32,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
 def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
     """Returns a run's configuration with some values changed, without reading YAML files.
 
-    Arguments are those of `resolve`; `setup`, `world`, `fire` and `learner` cannot change.
+    Arguments as for `resolve`; `setup`, `world`, `fire` and `learner` cannot change.
     """
     values, texts = to_values(config), []
     for text in overrides:
@@ -90,7 +90,7 @@ def differences(
 
 
 def from_values(values: Mapping[str, Any]) -> RunConfig:
-    """Returns a configuration from plain values, such as those of a run folder's config.yaml."""
+    """Returns a configuration from plain values, such as the content of a config.yaml."""
     values = {key: value for key, value in values.items() if key != "baselines"}
     for key, value in flat(values).items():
         check_not_removed(key, value)

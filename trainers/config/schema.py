@@ -72,7 +72,7 @@ class EvaluationConfig:
     interval_episodes: Many
     """episodes of an evaluation during training, each on another validation fire"""
     huygens: bool
-    """whether to evaluate on fires of the scenario `huygens`, too, besides that of the training"""
+    """whether to evaluate on fires of `huygens` besides the training's scenario"""
     scripted: Annotated[tuple[str, ...], Strict(False)]
     """scripted policies to evaluate"""
     headline: str

@@ -77,7 +77,7 @@ def _drop_settings_of_others(learner: dict[str, Any]) -> None:
 
 
 def _keys_of(learner: str) -> set[str]:
-    """Returns the keys in the file of a learner and in those of its `defaults`."""
+    """Returns the keys in the file of a learner and in the files of its `defaults`."""
     values = read("learner", learner)
     bases = [base for base in values.pop("defaults", ()) if base != "_self_"]
     return values.keys() | {key for base in bases for key in _keys_of(base)}
@@ -183,7 +183,7 @@ def unknown_key(key: str, known: Iterable[str]) -> str:
 
 
 def all_keys(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Yields the dotted keys of nested mappings, including those of inner mappings."""
+    """Yields the dotted keys of nested mappings, inner mappings included."""
     for key, value in values.items():
         yield f"{prefix}{key}"
         if isinstance(value, Mapping):

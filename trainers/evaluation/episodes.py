@@ -60,7 +60,7 @@ class Panel:
 
 
 def recorder_of(config: RunConfig, policy: Any, member: int = 0) -> Recorder:
-    """Returns a recorder of what a policy does in environment `member`."""
+    """Returns a recorder of a policy's episode in environment `member`."""
     written = build_comm(config, 1).out_keys
     advised = any(key in written for key in getattr(policy, "in_keys", ()))
     return Recorder(member=member, advised=advised, hears=getattr(policy, "hears", False))
@@ -86,9 +86,9 @@ def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, ScenarioConf
     """Returns the name, the scenario and the index of a held-out fire.
 
     Args:
-        text: NAME, INDEX or NAME:INDEX. The default name is that of `shown_scenario`, and the
-            default index is 0.
-        run: configuration of the run; the fires of its evaluation are known, too.
+        text: NAME, INDEX or NAME:INDEX. The defaults are the name of `shown_scenario` and
+            the index 0.
+        run: configuration of the run; the fires of its evaluation are known as well.
     """
     usual, evaluated = shown_scenario(run), evaluation_scenarios(run)
     name, colon, index = (usual if text is None else str(text)).rpartition(":")
@@ -111,7 +111,7 @@ def play_side_by_side(
     """Plays the same episode of each panel and returns the name of the fire and the episodes.
 
     Args:
-        panels: what is shown side by side.
+        panels: the policies to show side by side.
         fire: see `find_fire`.
         report: called with a line of text after each episode.
     """

@@ -34,7 +34,7 @@ from emberlink.trainers.evaluation.scores import LEARNED, Measured, Results, mea
 from emberlink.trainers.rollout.finite_actions import check_finite
 
 HELD_OUT_SCENARIO = "huygens"
-"""the scenario of evaluations with `evaluation.huygens`, besides that of the training"""
+"""the scenario of evaluations with `evaluation.huygens`, besides the training's"""
 START_SEED = 20_250_923
 """seed of test episode 0, including start positions; episode i has this seed plus i"""
 VALIDATION_START_SEED = 20_350_923
@@ -69,7 +69,7 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
             actions.append(td.get(keys.ACTION))
             after = td.get("next")
             if isinstance(policy, Scripted) and after.get(keys.BYTES_SENT, None) is not None:
-                sent = policy.bytes_sent(after)  # its messages, not those of the method
+                sent = policy.bytes_sent(after)  # its messages, not the method's
                 after.update({} if sent is None else {keys.BYTES_SENT: sent})
             if watch is not None:
                 watch(world, after)
@@ -87,7 +87,7 @@ def shown_scenario(config: RunConfig) -> str:
 
 
 def evaluation_scenarios(config: RunConfig) -> dict[str, ScenarioConfig]:
-    """Returns the scenarios of an evaluation by name: that of the training, maybe `huygens`."""
+    """Returns the scenarios of an evaluation by name: the training's, and maybe `huygens`."""
     scenarios: dict[str, ScenarioConfig] = {}
     if config.evaluation.huygens:
         scenarios[HELD_OUT_SCENARIO] = load_scenario(HELD_OUT_SCENARIO)
@@ -152,7 +152,7 @@ def validate(config: RunConfig, actor: Policy) -> dict[str, float]:
     """Evaluates a frozen policy on validation fires, for selecting the best checkpoint.
 
     `evaluation.interval_episodes` episodes are played, on other fires and from other starts than
-    those of tests. A batch has one environment per episode, at most `BLOCK`.
+    in tests. A batch has one environment per episode, at most `BLOCK`.
 
     Returns:
         "fire/measure" -> mean.
@@ -170,7 +170,7 @@ def validate(config: RunConfig, actor: Policy) -> dict[str, float]:
 def play_learned(
     config: RunConfig, actor: Policy, arrival: Tensor, *, watch: Watch | None = None, **more: Any
 ) -> Measured:
-    """Returns the measures of a frozen policy; arguments are those of `play_blocks`.
+    """Returns the measures of a frozen policy; arguments as for `play_blocks`.
 
     Where nobody watches, the steps of a held action are computed at once.
     """
@@ -189,7 +189,7 @@ def play_scripted(
     block: int = BLOCK,
     report: Callable[[str], None] = lambda _: None,
 ) -> Measured:
-    """Returns the measures of a scripted policy; arguments are those of `play_blocks`.
+    """Returns the measures of a scripted policy; arguments as for `play_blocks`.
 
     They are the same for all runs in an environment, so they are kept in a file.
     """

@@ -17,8 +17,8 @@ from emberlink.trainers.replay.screen import even_steps
 def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) -> None:
     """Draws the paper's figures 5 to 9 for one run as PNG.
 
-    Keys of `lines`, those of metrics.jsonl, are measures of the exploring policy, and
-    "fire/measure" for the frozen policy on validation fires.
+    Keys of `lines`, as in metrics.jsonl, are measures of the exploring policy, and "fire/measure"
+    for the frozen policy on validation fires.
     """
     figure = Figure(figsize=(11, 6), layout="constrained")
     figure.suptitle(title)

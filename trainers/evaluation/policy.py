@@ -42,7 +42,7 @@ class TrainedPolicy(TensorDictSequential):
         actor: the networks.
         config: configuration of the run.
         checkpoint: file of the networks, or `foreign.FOREIGN`.
-        changes: settings that are not those of the training, such as `env.radio.range=0`.
+        changes: settings that differ from the training's, such as `env.radio.range=0`.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class TrainedPolicy(TensorDictSequential):
             others: policies to show beside this one, on the same fire.
             fire: NAME, INDEX or NAME:INDEX of a held-out fire; `huygens:0`, or the first of the
                 run's own fires, if None.
-            policies: names of scripted policies to show, too.
+            policies: names of scripted policies to show as well.
 
         Raises:
             UserError: a name is not known, or the others have another map, team or horizon.
@@ -104,7 +104,7 @@ def load_policy(
 ) -> TrainedPolicy:
     """Returns the frozen policy of a run, with the configuration in its checkpoint and changes.
 
-    Arguments are those of `emberlink.trainers.load`; `overrides` are settings as texts `key=value`.
+    Arguments as for `emberlink.trainers.load`; `overrides` are settings as texts `key=value`.
     """
     folder = run.path
     if not folder.is_dir():
@@ -172,7 +172,7 @@ def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
 
 
 def units(config: RunConfig) -> tuple[str, ...]:
-    """Returns the keys that change what the numbers in observations and actions mean.
+    """Returns the keys that define the units of observations and actions.
 
     The grid is among them if a UAV observes where in the box it is.
     """

@@ -97,7 +97,7 @@ class Imitation(Learner):
             self.generator,
             batch_size=-(-config.samples // self.sequence),
             buffer_size=-(-config.buffer_size // self.sequence),
-            joint=speaks,  # messages are those of a team at one time
+            joint=speaks,  # the messages of a team at one time
             # With `agent_index`, the input is the index of a column.
             mixed=not speaks and not context.policy.agent_index,
             decisions=self.sequence,

@@ -21,7 +21,7 @@ from emberlink.envs.world.sensor import Sensor
 from emberlink.trainers.replay.recording import AGES, COUNTS, OF_BASE, ROLES, Episode
 
 SCRIPTS = ("unpack.js", "knowledge.js", "palette.js", "map.js", "curves.js", "replay.js")
-"""modules of the page, each after those that it imports"""
+"""modules of the page, each after the modules that it imports"""
 _IMPORT = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL)
 _EXPORT = re.compile(r"^export (?=const|function|class|async)", re.MULTILINE)
 _VERSION = 1  # of the data, see web/unpack.js
@@ -156,7 +156,7 @@ class _Arrays:
         self.content = b""
 
     def add(self, array: NDArray[Any], *, delta: bool = False) -> Mapping[str, Any]:
-        """Adds an array of integers or float32 and returns where and what it is.
+        """Adds an array of integers or float32 and returns its place, type and shape.
 
         With `delta` the differences along the last axis are stored, which compress better.
         """

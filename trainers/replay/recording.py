@@ -22,7 +22,7 @@ COUNTS = {"seen": keys.SEEN, "burning": keys.BURNING, "burnt": keys.BURNT}
 AGES = {"front_age": keys.FRONT_AGE, "front_age_p95": keys.FRONT_AGE_P95}
 OF_BASE = {"base_seen": keys.BASE_SEEN, "base_age": keys.BASE_AGE}
 ADVICE = {"follows": keys.FOLLOWS, "target": keys.TARGET}
-"""what a communication module tells the UAVs"""
+"""advice of a communication module to the UAVs"""
 ROLES = ("discoverer", "seeker", "wanderer")
 """the roles of UAVs in a consensus network (paper, section IV.F)"""
 
@@ -124,7 +124,7 @@ class Recorder:
             self._steps.setdefault(name, []).append(value[0].numpy().copy())
 
     def recording(self) -> Recording:
-        """Returns what was recorded."""
+        """Returns the recorded episode."""
         crop, times = self._sensor.crop, self._measures.times
         ignition, end = crop(times.ignition)[0].numpy(), crop(times.end)[0].numpy()
         steps = {name: np.stack(values) for name, values in self._steps.items()}

@@ -13,7 +13,7 @@ from emberlink.envs.rendering.frame import Chart, Colour, Pen
 from emberlink.trainers.replay.recording import ROLES, Episode, Recording
 
 SEEN_FIRE = (140, 140, 140)
-"""colour of seen fire if it differs from that of unseen fire (paper, figure 2)"""
+"""colour of seen fire where seen and unseen fire differ (paper, figure 2)"""
 LINK = (0, 200, 255)
 LINK_WIDTHS = {frame.NO_FIRE: 4, LINK: 2}
 """width in pixels of each line of a link; the dark edge is drawn first"""

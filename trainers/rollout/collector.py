@@ -20,7 +20,7 @@ class ResumableCollector:
     Args:
         env: batch of environments with communication; the policy's state is added to it.
         decisions: decisions of the batch of environments in the whole run.
-        rollout: decisions of a rollout; divides those of an episode.
+        rollout: decisions of a rollout; divides the decisions of an episode.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class ResumableCollector:
 
 
 class _Resets(Transform):
-    """Keeps the last reset, and gives another TensorDict in place of the next one if told to."""
+    """Keeps the last reset, and replaces the next one by another TensorDict if told to."""
 
     def __init__(self) -> None:
         super().__init__()

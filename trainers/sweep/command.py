@@ -32,7 +32,7 @@ def sweep(
 ) -> int:
     """Trains and evaluates the runs that are not finished, or only prints their states if `dry`.
 
-    `arguments` are those of `combinations`, and `executor=NAME` and `executor.KEY=VALUE`, which
+    `arguments` as for `combinations`, and also `executor=NAME` and `executor.KEY=VALUE`, which
     `executor` replaces. Returns 1 if a run failed, 128 and the number of a signal after it, else 0.
     """
     chosen = [text for text in arguments if text.startswith(("executor=", "executor."))]
@@ -69,7 +69,7 @@ def _table(runs: Sequence[Combination]) -> Table:
 
 
 def _check(runs: Sequence[Combination]) -> None:
-    """Checks that new runs can be trained; those that differ in their seed only, once."""
+    """Checks that new runs can be trained; of several that differ in the seed only, one."""
     for run in {identity(replace(run.config, seed=0)): run for run in reversed(runs)}.values():
         check_installed(run.config.logger)
         try:
@@ -108,7 +108,7 @@ class _Trainings:
                     elif not self._stopped:
                         self._stop()
                     self._look()
-            finally:  # after a second signal or an error, the trainings end, too
+            finally:  # the trainings end also after a second signal or an error
                 self._stop()
                 while self._running:
                     self._look()

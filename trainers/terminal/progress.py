@@ -11,7 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 class TrainingProgress:
     """Prints a line for each episode and each evaluation; a terminal also shows a bar.
 
-    `steps` and `episodes` are those of the whole training, `step` those done before.
+    `steps` and `episodes` count the whole training; `step` is where it begins.
     """
 
     def __init__(

@@ -24,7 +24,7 @@ class Interruption:
         self.received: int | None = None
         """number of the first signal; None before it"""
         self.at_once = False
-        """whether the first signal raises `Interrupted`, too"""
+        """whether even the first signal raises `Interrupted`"""
 
     def __enter__(self) -> "Interruption":
         for number in self._signals:

@@ -24,7 +24,7 @@ def resume(
     """Returns the training of a run folder, restored from its newest checkpoint.
 
     Metrics of later episodes and incomplete files are removed. A run without a checkpoint begins
-    again. `method` must be that of the run; the other arguments change keys of `MAY_CHANGE`.
+    again. `method` must be the run's; the other arguments change keys of `MAY_CHANGE`.
     """
     run = RunFolder(path)
     # The device of the run may not exist here, so it is replaced before it is checked.
@@ -65,7 +65,7 @@ def _restored(trainer: Trainer, run: RunFolder, lock: Lock, before: RunConfig) -
 
 
 def _other_versions(before: Mapping[str, str]) -> str:
-    """Returns the packages whose version is not that of `before`; "" if there are none."""
+    """Returns the packages whose version differs from `before`; "" if there are none."""
     now = checkpoint.versions()
     return ", ".join(f"{k} {v} (now {now.get(k)})" for k, v in before.items() if now.get(k) != v)
 

@@ -28,7 +28,7 @@ Means = Mapping[str, Mapping[str, float]]
 RANDOM, ALONE, ALL, ORACLE = "random_waypoints", "map_greedy_alone", "map_greedy_all", "oracle"
 """the scripted policies on which the conditions depend"""
 SHARES = ("coverage", "coverage_auc", "base_coverage", "base_coverage_auc")
-"""measures in %, of which more is better: the possible headlines of a calibrated world"""
+"""measures in % to be maximised: the possible headlines of a calibrated world"""
 MOST_AT_RANDOM = 50.0
 """% of the oracle's headline; random waypoints may reach at most this much"""
 LEAST_GAIN = 10.0
@@ -45,7 +45,7 @@ class Condition:
     name: str
     """the two policies"""
     ratio: float
-    """headline of the first, % of that of the second"""
+    """headline of the first, in % of the second's"""
     bound: float
     at_most: bool = False
     """whether the bound is an upper one"""

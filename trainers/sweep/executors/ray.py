@@ -41,7 +41,7 @@ class RayConfig:
 
 
 def _train(task: Task, threads: int) -> int:
-    """Trains in a process of its own, which saves if the task is cancelled; returns its status."""
+    """Trains in a new process, which saves if the task is cancelled; returns its status."""
     process = task.start(threads)
     try:
         while process.poll() is None:

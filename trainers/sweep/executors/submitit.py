@@ -126,7 +126,7 @@ class SubmititExecutor(Executor):
     def submit(self, tasks: Sequence[Task]) -> Sequence[_Handle]:
         try:
             executor = self._make(tasks[0].log.parent / "submitit")
-            # submitit prints sbatch's messages, too.
+            # submitit also prints sbatch's messages.
             with redirect_stderr(StringIO()), executor.batch():
                 jobs = [executor.submit(_Training(task, self._config.cpus)) for task in tasks]
         except (RuntimeError, OSError, ValueError, subprocess.CalledProcessError) as error:
@@ -173,7 +173,7 @@ class SubmititExecutor(Executor):
         return DIED
 
     def _is_queued(self, job: str) -> bool:
-        """Returns whether a job is queued or running, as far as known."""
+        """Returns whether a job is queued or running, by the last answer of SLURM."""
         # Not by submitit, whose sacct needs a cluster with accounting.
         if time.monotonic() - self._looked > _LOOK:
             self._looked = time.monotonic()
