@@ -112,7 +112,8 @@ def test_slurm_requeues_runs_that_are_preempted_or_whose_time_ends(local, tmp_pa
     wait_for(lambda: resumed(tmp_path), process)
     before = resumed(tmp_path)
     wait_for(lambda: training(tmp_path), process)
-    subprocess.run(["scancel", "--signal=USR2", "--me"], env=slurm, check=True)  # as at the end
+    # As at the end of the time. The status is not 0 if one of the jobs is just ending.
+    subprocess.run(["scancel", "--signal=USR2", "--me"], env=slurm, check=False)
     wait_for(lambda: resumed(tmp_path) > before, process)
     finish(process, tmp_path)
     said = [log.read_text() for log in (tmp_path / "runs/logs/submitit").glob("*.err")]

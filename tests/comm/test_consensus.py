@@ -101,6 +101,14 @@ def test_a_waypoint_is_redrawn_only_by_a_wanderer_closer_than_one():
     assert now[keys.TARGET][0, :2].equal(talk.module.waypoint[0, :2])
 
 
+def test_a_first_waypoint_closer_than_one_is_drawn_again():
+    world = WildfireConfig(grid=(8, 8), num_uavs=1, altitude=(2.0, 2.0))
+    position = torch.tensor([[3.5, 3.5, 2.0]]).expand(4000, 1, 3)
+    target = after_consensus(position, [0], world=world)[keys.TARGET]
+    # A random point is near with probability pi / 49 = 0.064, two in a row with 0.004.
+    assert ((target - position).norm(dim=-1) < 1).float().mean() < 0.02
+
+
 @pytest.mark.parametrize(("step", "redrawn"), [(49, False), (50, True)])
 def test_waypoints_that_are_not_reached_are_drawn_again_in_time(step, redrawn):
     # 0 and 1 wander far from their waypoints, 2 is a discoverer.

@@ -73,6 +73,12 @@ def test_a_cell_exactly_on_the_edge_is_in_view():
     assert counts(act(env)) == [(49, 0, 0), (0, 42, 0)]
 
 
+def test_an_altitude_that_float32_rounds_down_is_in_the_box():
+    env = world(altitude=(3.3, 4.1))
+    start(env, [5.0, 5, 3.3])
+    assert not act(env)[keys.HIT_BOUNDARY].any()
+
+
 def test_reset_starts_in_the_box_without_seen_cells():
     env = world(num_envs=200, num_uavs=3, altitude=(2.0, 3.0))
     env.rollout(5)

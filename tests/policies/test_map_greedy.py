@@ -52,6 +52,8 @@ def test_a_uav_flies_to_the_neighbourhood_of_known_fire():
     fire = torch.full((30, 30), NEVER)
     fire[7, 5] = 0
     assert first_plan(WildfireEnv(1, world(), fire), MapGreedy, [[5.0, 5, 4]]) == [[[7, 5]]]
+    ashes = torch.stack((fire, fire + 1))[None]  # burnt out when it is seen: it does not spread
+    assert first_plan(WildfireEnv(1, world(), ashes), MapGreedy, [[5.0, 5, 4]]) != [[[7, 5]]]
 
 
 def test_uavs_that_hear_each_other_choose_different_cells():

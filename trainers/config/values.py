@@ -51,8 +51,6 @@ def composed(method: str, overrides: Sequence[str] = (), **settings: Any) -> dic
 
     `overrides` are texts `key=value`, as on the command line; see `full_key` for `settings`.
     """
-    if isinstance(overrides, str):
-        raise UserError(f"{shown(overrides)!r}: expected a list of texts key=value")
     names = {"method": str(method), "setup": "paper", "world": "paper"}
     for text in overrides:
         key, equals, _ = text.partition("=")

@@ -2,6 +2,7 @@
 
 import platform
 import time
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 
 import torch
@@ -28,7 +29,7 @@ def doctor(console: Console) -> int:
         f"devices: cpu ({torch.get_num_threads()} threads), {', '.join(gpus) or 'no GPU'}"
     )
     console.print(f"fires from files: {_versions(*_GEO)} (extra geo)", soft_wrap=True)
-    checks = {"fire": _fire} | {method: _method(method) for method in known("method")}
+    checks = {"fire": _fire} | {method: partial(_method, method) for method in known("method")}
     began, failures = time.monotonic(), 0
     for name, check in checks.items():
         try:
@@ -56,11 +57,8 @@ def _fire() -> str:
     return f"{start} cells burn at the start, {end} at the end"
 
 
-def _method(method: str):
-    def check() -> str:
-        check_env_specs(make_env(method, num_envs=2, horizon=5, num_uavs=3))
-        setup = TrainingSetup(resolve(method, _TINY))
-        setup.dry_run(steps=20)
-        return f"environment and {setup.learner.updates} updates"
-
-    return check
+def _method(method: str) -> str:
+    check_env_specs(make_env(method, num_envs=2, horizon=5, num_uavs=3))
+    setup = TrainingSetup(resolve(method, _TINY))
+    setup.dry_run(steps=20)
+    return f"environment and {setup.learner.updates} updates"

@@ -138,7 +138,9 @@ def test_networks_that_never_saw_a_base_are_warned_of():
         trainers.load("pretrained:maps", world="relay")
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
-        trainers.load("pretrained:maps", world="swarm")
+        trainers.load("pretrained:maps", world="swarm", grid=[40, 30])
+    with pytest.warns(UserWarning, match=r"^env\.grid=\[40, 30\] .*something else here"):
+        trainers.load("pretrained:consensus", grid=[40, 30])  # which observes where it is
 
 
 def test_a_run_is_evaluated_on_a_fire_of_a_file(run, tmp_path):

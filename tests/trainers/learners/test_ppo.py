@@ -1,7 +1,7 @@
 """Tests the learners from whole episodes: IPPO and MAPPO."""
 
 import math
-from itertools import islice
+from itertools import combinations, islice
 from typing import Any
 
 import pytest
@@ -172,6 +172,11 @@ def test_only_mappos_critic_reads_the_true_map():
     assert before[:, :2].equal(after[:, :2])
     assert not before[:, 2:].isclose(after[:, 2:]).any()
     assert learner.losses(batch)["actor"].equal(learner.losses(changed)["actor"])
+    values = []
+    for kind in range(3):  # no, seen and unseen fire everywhere
+        changed[keys.TRUE_MAP].fill_(kind)
+        values.append(learner.critic(changed.copy())[VALUE].clone())
+    assert not any(one.isclose(other).any() for one, other in combinations(values, 2))
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
