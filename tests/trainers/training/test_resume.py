@@ -28,12 +28,13 @@ SMALL = [
 ]
 # A replay buffer of 60 rows is full after 30 of the 80 steps.
 REPLAY = ["learner.batch_size=16", "learner.buffer_size=60"]
-GRU = ["policy.memory=gru", "policy.units=6", "learner.epochs=2", "learner.minibatches=2"]
+GRU = ["policy.memory=gru", "policy.units=6"]
+FEW = ["learner.epochs=2", "learner.minibatches=2"]
 LEARNERS = {
     "ddpg": ["learner=ddpg", *REPLAY],
     "td3": ["learner=td3", *REPLAY, "learner.critic=team"],
-    "ippo": ["learner=ippo", *GRU, "learner.share_parameters=false"],
-    "mappo": ["learner=mappo", *GRU, "learner.critic_map=true"],
+    "ippo": ["learner=ippo", *FEW, *GRU, "learner.share_parameters=false"],
+    "mappo": ["learner=mappo", *FEW, *GRU, "learner.critic_map=true"],
     "imitation": ["learner=imitation", "learner.samples=8", "learner.buffer_size=60"],
 }
 
