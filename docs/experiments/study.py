@@ -29,14 +29,13 @@ OF_MAP = [
     *("learner.gamma=0.95", "learner.gae_lambda=0.95", "learner.epochs=2", "learner.lr=5e-4"),
     *("learner.log_std=-1.2", "num_envs=32", "episodes=40", "evaluation.interval=2"),
 ]
-ATTENTION, UNLIMITED = "policy.message=attention", "env.radio.range=.inf"
+ATTENTION = "policy.message=attention"
 EXCHANGES: dict[str, tuple[str, Sequence[str]]] = {
     "none": ("independent", []),
     "attention": ("independent", [ATTENTION]),
     "maps": ("maps", []),
     "consensus": ("consensus", []),
-    "maps_unlimited": ("maps", [UNLIMITED]),
-    "attention_unlimited": ("independent", [ATTENTION, UNLIMITED]),
+    "maps_unlimited": ("maps", ["env.radio.range=.inf"]),
     "positions": ("positional", []),
     "mean": ("independent", ["policy.message=mean"]),
     # As many bytes a step: a message and its key of 8 bytes are sent once in ten steps.
@@ -46,21 +45,26 @@ EXCHANGES: dict[str, tuple[str, Sequence[str]]] = {
     "attention_64": ("independent", [ATTENTION, "policy.message_size=632"]),
 }
 """name -> method and settings: all in which arms with the same observation differ"""
-OF_WORLD = {
-    "vector": ("none", "attention"),
-    "map": ("none", "attention", "maps", "maps_unlimited"),
+ARMS: dict[str, dict[str, Sequence[str]]] = {
+    "front": {
+        "vector": ("none", "attention", "consensus", "positions", "mean"),
+        "map": tuple(name for name in EXCHANGES if name not in ("positions", "mean")),
+    },
+    "relay": {
+        "vector": ("none", "attention"),
+        "map": ("none", "attention", "maps", "maps_unlimited"),
+    },
+    "paper": {"vector": ("none", "attention"), "map": ("none", "maps")},
+    "swarm": {"map": ("none", "maps")},
 }
-"""exchanges of the worlds other than `front`"""
+"""world -> observation -> exchanges"""
 MOST = "none", "attention", "maps", "consensus"
 """exchanges with 10 seeds in `front`; all others have 5"""
 
 
 def arms(world: str) -> list[tuple[str, str]]:
     """Returns observation and exchange of each arm of a world."""
-    if world != "front":
-        return [(observed, name) for observed, names in OF_WORLD.items() for name in names]
-    of_vector = [n for n in EXCHANGES if not n.startswith("maps") and not n[-1].isdigit()]
-    return [*(("vector", name) for name in of_vector), *(("map", name) for name in EXCHANGES)]
+    return [(observed, name) for observed, names in ARMS[world].items() for name in names]
 
 
 def settings(world: str, observed: str, name: str) -> list[str]:

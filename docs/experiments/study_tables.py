@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from study import WORLDS, arms
 
 from emberlink.trainers.comparison import bootstrap
@@ -23,27 +24,20 @@ PLANNED = [
     ("front", "map_attention", "map_maps"),
     ("front", "map_attention_16", "map_maps_16"),
     ("front", "map_attention_64", "map_maps_64"),
-    *(
-        (world, one, other)
-        for world in ("relay", "paper", "swarm")
-        for one, other in (
-            ("vector_attention", "vector_none"),
-            ("map_attention", "map_none"),
-            ("map_maps", "map_none"),
-        )
-    ),
+    ("relay", "vector_attention", "vector_none"),
+    ("relay", "map_attention", "map_none"),
+    ("relay", "map_maps", "map_none"),
+    ("paper", "vector_attention", "vector_none"),
+    ("paper", "map_maps", "map_none"),
+    ("swarm", "map_maps", "map_none"),
 ]
 """the comparisons: world, and the two arms"""
-VALUES = [
-    ("vector_none", "vector_attention", "vector_attention_unlimited"),
-    ("map_none", "map_attention", "map_attention_unlimited"),
-    ("map_none", "map_maps", "map_maps_unlimited"),
-]
+UNLIMITED = "map_none", "map_maps", "map_maps_unlimited"
 """arms without radio, with that of the world, and with one without limits"""
 
 
 def main(output: str) -> None:
-    """Prints the arms of each world, the comparisons and the values of communication."""
+    """Prints the arms of each world, the comparisons and the value of communication."""
     compared: dict[str, Comparison] = {}
     for world in WORLDS:
         folders = [Path(output) / world / "_".join(arm) for arm in arms(world)]
@@ -63,9 +57,9 @@ def main(output: str) -> None:
             ends = bootstrap.crossed_interval(bootstrap.iqm_difference, *found)
             _row(world, f"{one} - {other}", f"{value:.1f}", _ends(ends), f"{next(corrected):.4f}")
     _head("world", "arm", "value of communication")
-    for world, arms_of in [(world, names) for world in compared for names in VALUES]:
-        if found := samples(compared[world], arms_of):
-            _row(world, arms_of[1], value_of_communication(*found))
+    for world, runs in compared.items():
+        if found := samples(runs, UNLIMITED):
+            _row(world, UNLIMITED[1], value_of_communication(*found))
 
 
 def print_arms(world: str, compared: Comparison) -> None:
@@ -114,7 +108,9 @@ def value_of_communication(none: Any, arm: Any, full: Any) -> str:
 
 
 def _ends(ends: Any, digits: int = 1) -> str:
-    return "" if ends is None or None in ends else f"[{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]"
+    if ends is None or pd.isna([*ends]).any():
+        return ""
+    return f"[{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]"
 
 
 def _head(*names: str) -> None:

@@ -196,9 +196,10 @@ def read_text(path: Path, max_bytes: int) -> str:
 
 
 def without_time_and_seed(path: str) -> str:
-    """Returns the path of a run without the time and the seed in a name that `create` has made."""
-    made = re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_(.+)_s\d+(_\d+)?", Path(path).name)
-    return str(Path(path).with_name(made[1])) if made else path
+    """Returns the path of a run without what tells seeds apart in names of trainings and sweeps."""
+    time, digest = r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_", "[0-9a-f]{8}"
+    made = re.fullmatch(rf"{time}(.+)_s\d+(_\d+)?|(.+)_s\d+_{digest}", Path(path).name)
+    return str(Path(path).with_name(made[1] or made[3])) if made else path
 
 
 def _is_ordinary(path: Path) -> bool:

@@ -190,8 +190,11 @@ def test_seeds_with_a_warm_start_each_are_one_row(tmp_path):
         start = f"runs/2026-11-2{seed}_01-36-35_maps_tuned_front_s{seed}"
         write_run(tmp_path, "consensus", seed, overrides=("learner=ippo", f"{START}={start}"))
     write_run(tmp_path, "consensus", 3, overrides=("learner=ippo", f"{START}=runs/other"))
+    for seed in (4, 5):  # of a sweep
+        start = f"runs/independent_tuned_front_s{seed}_1f0c3a{seed}e"
+        write_run(tmp_path, "consensus", seed, overrides=("learner=ippo", f"{START}={start}"))
     ((_, of_section),) = labels(tmp_path).items()
-    assert list(of_section.values()) == [[0, 1, 2], [3]]
+    assert sorted(of_section.values()) == [[0, 1, 2], [3], [4, 5]]
 
 
 START = "learner.warm_start"
