@@ -111,10 +111,10 @@ class BeliefMaps(nn.Module):
         """Returns the last look of each UAV at each cell, as it knows it.
 
         Returns:
-            The step, int64 [envs, n, X, Y], -1 for never, and the cell's state then: 0 no fire, 1
-            fire, 2 burnt out; 3 for never.
+            The step, integers [envs, n, X, Y], -1 for never, and the cell's state then: 0 no fire,
+            1 fire, 2 burnt out; 3 for never.
         """
-        known = self.sensor.crop(self.known.last_seen).long()
+        known = self.sensor.crop(self.known.last_seen)
         return known >> 2, known & 3
 
     def _draw(self, tensordict: TensorDictBase, env: Tensor) -> Tensor:

@@ -33,18 +33,18 @@ class KnownMaps:
         self._maps = maps
 
     def update(self, tensordict: TensorDictBase) -> None:
-        """Reads the links of a time step, if there are any; the maps are updated already."""
+        """Reads the maps, which are updated already, and the links of a time step, if any."""
         nobody = torch.zeros_like(self._maps.stamp, dtype=torch.bool)
         self.reach = tensordict.get(keys.HEARS, nobody)
+        self._last, self._state = self._maps.sightings()
 
     def last_seen(self) -> Tensor:
         """Returns the last step at which each UAV knows each cell seen, float [envs, n, X, Y]."""
-        return self._maps.sightings()[0].float()
+        return self._last.float()
 
     def was_fire(self, last_seen: Tensor) -> tuple[Tensor, Tensor]:
         """Returns whether cells had ignited and had burnt out when they were last seen."""
-        seen = self._maps.sightings()[1]
-        return (seen == 1) | (seen == 2), seen == 2
+        return (self._state == 1) | (self._state == 2), self._state == 2
 
 
 class Teacher(Transform):
