@@ -1,20 +1,11 @@
 """Measures UAV-steps per second of the environment, and of VMAS in the same run."""
 
 import pytest
-from workloads import flying, in_turns, make, vmas_flying
-
-from emberlink.trainers.build import build_env
-from emberlink.trainers.config.compose import resolve
-
-
-def strong(method: str, num_envs: int, *options: str, hold: int = 1):
-    """Returns a training environment of `strong` that holds actions."""
-    config = resolve(method, ["setup=strong", "fire.num_train_fires=16", *options])
-    return build_env(config, num_envs=num_envs, fire=config.fire, seed=0, device="cpu", hold=hold)
+from workloads import flying, in_turns, jaxmarl_flying, make, strong, vmas_flying
 
 
 @pytest.mark.parametrize("world", ["paper", "front"])
-@pytest.mark.parametrize("method", ["independent", "consensus"])
+@pytest.mark.parametrize("method", ["independent", "consensus", "maps"])
 def test_held_actions(tell, method, world):
     """64 environments: a call of `step` for ten steps, beside ten calls."""
     works = [flying(strong(method, 64, f"world={world}", hold=h), 20 // h) for h in (1, 10)]
@@ -38,4 +29,16 @@ def test_beside_vmas(tell, scenario):
         f"vmas {scenario:13} {num_envs} environments: {rate:12,.0f} agent-steps/s; ours alone "
         f"{6 * num_envs * steps / ours / rate:.1f} x, with consensus "
         f"{6 * num_envs * steps / consensus / rate:.1f} x that"
+    )
+
+
+@pytest.mark.parametrize("num_envs", [64, 1024])
+def test_beside_jaxmarl(tell, num_envs):
+    pytest.importorskip("jaxmarl")
+    theirs, agents = jaxmarl_flying(num_envs, 200)
+    ours, jaxmarl = in_turns(5, flying(strong("independent", num_envs, hold=10), 20), theirs)
+    rate = agents * num_envs * 200 / jaxmarl
+    tell(
+        f"JaxMARL simple_spread {num_envs} environments, 200 steps a call: {rate:12,.0f} "
+        f"agent-steps/s; ours, held, {6 * num_envs * 200 / ours / rate:.2f} x that"
     )

@@ -9,13 +9,14 @@ a faster or a busy machine affects both.
 """
 
 import json
+import math
 import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import torch
-from workloads import batch_of, flying, in_turns, make, matrix_product
+from workloads import batch_of, flying, in_turns, make, matrix_product, strong
 
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.setup import TrainingSetup
@@ -54,6 +55,14 @@ def works() -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:
         "one environment, consensus": (flying(make("consensus", 1), 20), small_calls),
         "1024 environments": (flying(make(None, 1024), 3), gathers()),
         "1024 environments, consensus": (flying(make("consensus", 1024), 2), gathers()),
+        "maps, 8 environments of front, held": (
+            flying(strong("maps", 8, "world=front", hold=10), 2),
+            gathers(),
+        ),
+        "maps, 64 UAVs in contact": (
+            flying(make("maps", 1, num_uavs=64, **{"env.radio.range": math.inf}), 5),
+            gathers(),
+        ),
         "update": (lambda: setup.learner.update(batch), matrix_product()),
     }
 

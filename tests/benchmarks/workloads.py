@@ -16,6 +16,7 @@ from emberlink.envs import keys
 from emberlink.envs.utils.config_files import known
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
+from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.learners.replay import to_batch
 from emberlink.trainers.training.setup import TrainingSetup
@@ -43,6 +44,12 @@ def make(method: str | None, num_envs: int, **settings):
         config = resolve("independent", **settings).env
         return WildfireEnv(num_envs, config)
     return make_env(method, num_envs=num_envs, **settings)
+
+
+def strong(method: str, num_envs: int, *options: str, hold: int = 1):
+    """Returns a training environment of the setup `strong`, which may hold actions."""
+    config = resolve(method, ["setup=strong", "fire.num_train_fires=16", *options])
+    return build_env(config, num_envs=num_envs, fire=config.fire, seed=0, device="cpu", hold=hold)
 
 
 def flying(env, steps: int) -> Callable[[], object]:
@@ -76,6 +83,36 @@ def vmas_flying(scenario: str, num_envs: int, steps: int) -> tuple[Callable[[], 
             env.step([env.get_random_action(agent) for agent in env.agents])
 
     return fly, env.n_agents
+
+
+def jaxmarl_flying(num_envs: int, steps: int) -> tuple[Callable[[], object], int]:
+    """Returns a function that runs steps of JaxMARL's `simple_spread`, and its number of agents."""
+    import jax  # pyright: ignore[reportMissingImports]
+    from jaxmarl import make  # pyright: ignore[reportMissingImports]
+
+    env = make("MPE_simple_spread_v3")
+    reset, step, split = jax.vmap(env.reset), jax.vmap(env.step), jax.random.split
+
+    def one(carried, _):
+        key, state = carried
+        key, *keys_of = split(key, env.num_agents + 2)
+        actions = {
+            agent: jax.vmap(env.action_space(agent).sample)(split(own, num_envs))
+            for agent, own in zip(env.agents, keys_of[1:], strict=True)
+        }
+        _, state, reward, _, _ = step(split(keys_of[0], num_envs), state, actions)
+        return (key, state), sum(value.sum() for value in reward.values())
+
+    many = jax.jit(lambda carried: jax.lax.scan(one, carried, None, length=steps))
+    key = jax.random.PRNGKey(0)
+    carried = key, reset(split(key, num_envs))[1]
+
+    def fly() -> None:
+        nonlocal carried
+        carried, rewards = many(carried)
+        jax.block_until_ready(rewards)
+
+    return fly, env.num_agents
 
 
 def matrix_product(device: str = "cpu") -> Callable[[], object]:
