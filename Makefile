@@ -22,7 +22,7 @@ PIP := $(BIN)/python -m pip install -q --no-compile --disable-pip-version-check 
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-cluster soak bench guard lint typecheck docs install browser clean
+.PHONY: help demo test test-slow test-cluster test-clients soak bench guard lint typecheck docs install browser clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -49,6 +49,16 @@ browser:  ## install Chromium for test-slow if it is missing (on Debian and as r
 test-cluster: $(INSTALLED)  ## test sweeps on SLURM and Ray (15 to 40 minutes; root; docs/cluster.md)
 	@$(BIN)/python -c 'import submitit, ray' 2>/dev/null || $(PIP) -e '.[slurm,ray]'
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -p no:xdist -o python_files='cluster_*.py' tests/cluster
+
+# Each in an environment of its own, since BenchMARL needs an older torchrl.
+test-clients: $(INSTALLED)  ## train with BenchMARL, Stable-Baselines3 and plain PyTorch (10 minutes)
+	@mkdir -p build/clients; for client in benchmarl:benchmarl sb3:stable-baselines3 ppo:pip; do \
+		name=$${client%%:*}; venv=$(VENV)/clients/$$name; \
+		[ -e $$venv/installed ] || { $(PYTHON) -m venv $$venv && \
+			$$venv/bin/pip install -q "$$(grep '^torch==' constraints.txt)" $${client##*:} -e . && \
+			touch $$venv/installed; } || exit 1; \
+		python=$$PWD/$$venv/bin/python script=$$PWD/tests/clients/$$name.py; \
+		(cd build/clients && OMP_NUM_THREADS=1 $$python $$script) || exit 1; done
 
 soak: $(INSTALLED)  ## kill, interrupt and damage trainings repeatedly (about half an hour)
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/soak/soak.py $(SOAK)

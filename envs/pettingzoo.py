@@ -42,7 +42,8 @@ def parallel_env(
             `emberlink.trainers.make_env` returns; without it, a `WildfireEnv` is made.
         render_mode: "rgb_array", "human" (a window) or None.
         max_cycles: steps of an episode, instead of the config's horizon.
-        kwargs: for `WildfireEnv`, if there is no `env`.
+        kwargs: for `WildfireEnv`, if there is no `env`. Without a `config`, observations are scaled
+            (`observation_scale="box"`), and the reward is that of the scenario's configuration.
 
     Raises:
         UserError: another render mode, more than one environment, or `env` beside other settings.
@@ -50,14 +51,14 @@ def parallel_env(
     if env is not None and (kwargs or max_cycles is not None):
         given = sorted([*kwargs, *(["max_cycles"] if max_cycles is not None else [])])
         raise UserError(f"settings cannot be given with an existing environment, got {given}")
-    if max_cycles is not None:
-        config = kwargs.get("config") or default_config(kwargs.get("fire"))
+    if env is None:
+        scaled = dataclasses.replace(default_config(kwargs.get("fire")), observation_scale="box")
+        config = kwargs.pop("config", None) or scaled
         try:
-            kwargs["config"] = dataclasses.replace(config, horizon=max_cycles)
+            config = dataclasses.replace(config, horizon=max_cycles or config.horizon)
         except ValidationError as error:
             raise UserError(f"max_cycles: {describe(error)}") from None
-    if env is None:
-        env = WildfireEnv(**{"num_envs": 1, **kwargs})
+        env = WildfireEnv(**{"num_envs": 1, "config": config, **kwargs})
     return WildfireParallelEnv(env, render_mode)
 
 

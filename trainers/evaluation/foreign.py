@@ -7,6 +7,7 @@ import json
 import re
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -56,7 +57,8 @@ class ForeignPolicy(TensorDictModuleBase):
         self.in_keys, self.out_keys = reads, writes
         self._stateful = self._primer = None
         if isinstance(policy, TensorDictModuleBase):
-            self._primer = get_primers_from_module(policy, warn=False)
+            with warnings.catch_warnings(action="ignore"):  # that there is none
+                self._primer = get_primers_from_module(policy)
         else:
             self._stateful = takes_state(policy)
 

@@ -23,8 +23,6 @@ from tensordict.nn import (
 from torch import Tensor
 from torchrl.data import Composite
 from torchrl.modules import IndependentNormal
-from torchrl.objectives.multiagent import MAPPOLoss
-from torchrl.objectives.value import MultiAgentGAE
 
 from emberlink.envs import keys
 from emberlink.policies.gaussian import LOG_PROB, MEAN, MEMORY, GaussianActor, GaussianExplorer
@@ -112,6 +110,9 @@ class PPO(Learner, ABC):
 
     def __init__(self, config: Any, context: LearnerContext):
         self.config, self.context = config, context
+        # Imported here, as torchrl 0.11, with which policies fly in BenchMARL, does not have them.
+        from torchrl.objectives.value import MultiAgentGAE
+
         # Networks.
         specs = context.observation_spec, context.action_spec
         initial = torch.Generator().manual_seed(context.seed)
@@ -181,7 +182,9 @@ class PPO(Learner, ABC):
     def make_critic(self, context: LearnerContext, generator: torch.Generator) -> TensorDictModule:
         """Returns new critics, which read `CRITIC_STATE` first and write `VALUE` for chunks."""
 
-    def _make_loss(self) -> MAPPOLoss:
+    def _make_loss(self) -> Any:
+        from torchrl.objectives.multiagent import MAPPOLoss
+
         outputs: list[Any] = [MEAN, _STD]
         draw = ProbabilisticTensorDictModule(
             in_keys={"loc": MEAN, "scale": _STD},  # pyright: ignore[reportArgumentType]

@@ -1,6 +1,7 @@
 """Sets up a training: the environments, the learner and the collector of a configuration."""
 
 from collections.abc import Mapping
+from importlib.metadata import version
 from itertools import islice
 from typing import Any
 
@@ -8,6 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.policies.hold import held
 from emberlink.trainers.build import build_env, build_learner
 from emberlink.trainers.config.schema import RunConfig
@@ -22,6 +24,11 @@ class TrainingSetup:
     """Holds all objects that training changes, and accesses no files."""
 
     def __init__(self, config: RunConfig):
+        if tuple(map(int, version("torchrl").split(".")[:2])) < (0, 14):
+            raise UserError(
+                f"a training needs torchrl 0.14; version {version('torchrl')} is installed, with "
+                "which environments and evaluations work"
+            )
         self.config, self.horizon = config, config.env.horizon
         self.total_steps = config.episodes * self.horizon
         self.step = 0
