@@ -55,8 +55,7 @@ class Perimeters(Fire):
             begun += labels[1] - len(np.unique(labels[0][new & beside]))
             idle += k > 0 and not new.any()
             if k > 0:
-                passed, left = (tree.query(centres[new])[0] for tree in (last, front))
-                share = passed / np.maximum(passed + left, 1e-9)
+                share = _share(last, front, centres[new])
                 times[new] = self.at[k - 1] + (self.at[k] - self.at[k - 1]) * share
             else:
                 times[new] = self.at[0]
@@ -84,13 +83,31 @@ def _outline(parts: np.ndarray, side: float) -> np.ndarray:
     return shapely.get_coordinates(shapely.segmentize(shapely.boundary(parts), apart))
 
 
+def _share(last: KDTree, front: KDTree, points: np.ndarray) -> np.ndarray:
+    """Returns how far points are on their way from one front to the next, 0 to 1, [n].
+
+    A point is compared with the point of the next front that lies in the same direction from the
+    same place of the last one: both have moved with the same speed.
+    """
+    (passed, here), (whole, there) = last.query(points), last.query(front.data)
+    reach = float(whole.mean()) + 1e-9
+
+    def rays(ends: np.ndarray, feet: Any, lengths: np.ndarray) -> np.ndarray:
+        away = (ends - last.data[feet]) / np.maximum(lengths, 1e-9)[:, None]
+        return np.hstack([last.data[feet], reach * away])
+
+    ahead = KDTree(rays(front.data, there, whole)).query(rays(points, here, passed))[1]
+    return np.minimum(passed / np.maximum(whole[ahead], 1e-9), 1)
+
+
 def _front(edge: np.ndarray, burnt: np.ndarray, points: Window) -> np.ndarray:
-    """Returns points of some edges that don't lie within the burnt area, one in a 16th sample."""
+    """Returns points of edges that don't lie in the burnt area, four in a sample at most."""
     inner: Any = binary_erosion(burnt, EIGHT)
     i, j, there = points.cells(*edge.T)
     there[there] = inner[i[there], j[there]]
     edge = edge[~there]
-    x, y = np.floor(edge / (points.side / 4)).astype(np.int64).T
+    edge = edge[np.lexsort(edge.T)]  # whatever the order of the file
+    x, y = np.floor(edge / (points.side / 2)).astype(np.int64).T
     return edge[np.unique(x * 2**31 + y, return_index=True)[1]]
 
 

@@ -8,6 +8,7 @@ import json
 import re
 import zipfile
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -136,10 +137,12 @@ def _shapes(geometries: Sequence[Any]) -> Sequence[Any]:
     if kinds != {"Polygon1"}:
         shape = library("shapely.geometry").shape
         return [shape(geometry) if geometry else None for geometry in geometries]
-    rings = [np.array(geometry["coordinates"][0], float)[:, :2] for geometry in geometries]
+    rings = [geometry["coordinates"][0] for geometry in geometries]
     of = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
+    flat = np.fromiter(chain.from_iterable(chain.from_iterable(rings)), float)
+    points = flat.reshape(len(of), -1)[:, :2]
     shapely = library("shapely")
-    return shapely.polygons(shapely.linearrings(np.concatenate(rings), indices=of))
+    return shapely.polygons(shapely.linearrings(points, indices=of))
 
 
 def _texts_of_kml(path: Path, kind: str) -> list[bytes]:

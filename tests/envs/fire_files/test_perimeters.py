@@ -45,10 +45,10 @@ def test_a_fire_is_the_same_from_its_raster_and_from_its_perimeters(tmp_path, na
     fronts = read(tmp_path / "fire.shp", grid, **span)
     pairs = [(cells <= step, fronts <= step) for step in range(300, 1001, 50)]
     shares = [((a & b).sum() / (a | b).sum()).item() for a, b in pairs]
-    assert min(shares) > 0.92, shares
-    assert np.mean(shares) > 0.97, shares
+    assert min(shares) > 0.95, shares
+    assert np.mean(shares) > 0.985, shares
     later = torch.isfinite(cells) & torch.isfinite(fronts) & (cells > 0) & (fronts > 0)
-    assert (cells - fronts)[later].abs().mean() < 0.06 * HORIZON
+    assert (cells - fronts)[later].abs().mean() < 0.01 * HORIZON
 
 
 def test_before_the_first_perimeter_by_hand(tmp_path):
@@ -102,7 +102,7 @@ def test_each_kind_of_geometry_in_each_format(tmp_path, kind, suffix):
     plain, fire = read(tmp_path / "plain.gpkg"), read(path)
     assert torch.equal(torch.isfinite(fire), torch.isfinite(plain))
     both = torch.isfinite(plain)
-    assert torch.allclose(fire[both], plain[both], atol=1e-2)
+    assert torch.allclose(fire[both], plain[both], atol=1)  # a thousandth of the episode
 
 
 def test_between_two_squares_by_hand(tmp_path):
