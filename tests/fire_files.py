@@ -6,12 +6,16 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import geopandas
 import numpy as np
 import rasterio
 import shapely
 from rasterio.transform import from_origin
+
+from emberlink.envs.fire_files.reader import read_with_summary
+from emberlink.trainers.config.compose import resolve
 
 CELL = 30.0
 CORNER = 500_000.0, 4_000_000.0
@@ -93,12 +97,14 @@ def write_tif(path: Path, times: np.ndarray, cell: float = CELL, **about: object
 
 
 def frame_of(
-    fire: Ellipses, times: Sequence[float], kind: str = "polygon", column: str = "Elapsed_Mi"
+    fire: Ellipses, times: Sequence[float], kind: str = "polygon"
 ) -> geopandas.GeoDataFrame:
     """Returns perimeters at some elapsed minutes, in the coordinates of the rasters."""
     shapes = [shapely.transform(fire.perimeter(time), lambda at: at + CORNER) for time in times]
     return geopandas.GeoDataFrame(
-        {column: np.array(times, float)}, geometry=[KINDS[kind](shape) for shape in shapes], crs=UTM
+        {"Elapsed_Mi": np.array(times, float)},
+        geometry=[KINDS[kind](shape) for shape in shapes],
+        crs=UTM,
     )
 
 
@@ -138,6 +144,31 @@ def keys_in(message: str) -> list[str]:
     found = re.findall(r"""'fire\.[^']*'|fire\.\w+=(?:"[^"]*"|[^\s,;]+)""", tail)
     count = 2 if found and found[0].startswith("fire.incident_field") else 1
     return [shlex.split(text)[0] for text in found[:count]]
+
+
+def answered(path: Path, keys: dict[str, Any], *, questions: int = 4) -> tuple:
+    """Reads a file and gives the keys that its questions print.
+
+    Returns the fires on 20 x 20 cells, what `read:` says, and the questions in one line each;
+    without fires if a question prints no keys, or after a number of questions.
+    """
+    given, asked = {f"fire.{key}": value for key, value in keys.items()}, []
+    printed: dict[str, str] = {}
+    while len(asked) < questions:
+        texts = ["fire=file", "fire.ring_width=null", *map("=".join, printed.items())]
+        config = resolve("independent", texts, **given, **{"fire.path": str(path)}).fire
+        try:
+            return *read_with_summary(config, (20, 20), 100), asked
+        except ValueError as error:
+            asked.append(text := str(error))
+        assert "\n" not in text
+        assert path.name in text
+        assert asked.count(text) == 1
+        if not (more := keys_in(text)):
+            break
+        printed |= {key: value for key, _, value in (item.partition("=") for item in more)}
+        given = {key: value for key, value in given.items() if key not in printed}
+    return None, "", asked
 
 
 def points_text(fire: Ellipses, lines: int, skipped: int = 6000, points: int = 90) -> str:

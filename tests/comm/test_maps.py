@@ -3,14 +3,13 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv, check_env_specs
+from torchrl.envs import TransformedEnv
 
 from emberlink.comm.base import Communication
 from emberlink.comm.maps import Maps, MapsConfig, steer_home
 from emberlink.envs import keys
 from emberlink.envs.config import MapConfig, RadioConfig, WildfireConfig
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.trainers import make_env
 
 OBSERVED = (keys.OBSERVATION, keys.CROPS)
 
@@ -49,15 +48,6 @@ def burning(seed: int = 0, side: int = 30) -> torch.Tensor:
 def random_flight(steps: int, uavs: int, envs: int = 1, seed: int = 0) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
     return torch.rand(steps, envs, uavs, 3, generator=generator) * 2 - 1
-
-
-def test_specs_and_shapes():
-    env = make_env("maps", num_envs=2, horizon=6, num_uavs=3, fire=burning()[0, 0])
-    check_env_specs(env)
-    assert env.rollout(5)["next"][keys.CROPS].shape == (2, 5, 3, 2, 8, 24, 24)
-    assert keys.observation_keys(env.observation_spec) == list(OBSERVED)
-    more = make_env("maps", "tuned", world="relay", num_train_fires=2, **{"env.map.position": True})
-    assert more.observation_spec[keys.OBSERVATION].shape == (1, 6, 4)
 
 
 def test_uavs_are_home_in_time_whatever_the_policy_does():
@@ -144,29 +134,6 @@ def test_what_a_uav_sees_is_what_is_there():
                     assert td[keys.SIGHT][0, uav, a + 2, b + 2] == expected
         scene.append(td[keys.SIGHT])
     assert set(torch.stack(scene).unique().tolist()) == {0, 1, 2, 3}
-
-
-def test_a_disconnected_uav_learns_nothing():
-    """In two worlds, the other UAV flies elsewhere, over another fire."""
-    here, steps = [5.0, 5.0, 3.0], 20
-    away = [[25.0, 25.0, 3.0], [20.0, 27.0, 3.0]]
-    own, near = random_flight(steps, 1, seed=1), burning()[..., :14, :]
-    flights, observed = [], []
-    for other, seed in zip(away, (2, 3), strict=True):
-        position = torch.tensor([[here, other]])
-        actions = torch.cat((own, random_flight(steps, 1, seed=seed)), 2)
-        actions[..., :2] *= 0.4  # so that they stay apart
-        fire = torch.cat((near, burning(seed)[..., 14:, :]), -2)
-        more = {"scales": (1, 4), "base": (0.0, 15.0), "radio": RadioConfig(range=10.0)}
-        env = environment(fire, position, **more)
-        flights.append(fly(env, position, actions))
-        assert not any(td[keys.HEARS].any() for td in flights[-1])
-        assert not any(td[keys.BYTES_SENT].any() for td in flights[-1])
-        observed.append((env, flights[-1][-1]))
-    for one, two in zip(*flights, strict=True):
-        assert one[keys.SIGHT][0, 0].equal(two[keys.SIGHT][0, 0])
-        for key in OBSERVED:
-            assert one[key][0, 0].equal(two[key][0, 0])
 
 
 def test_lost_messages_are_counted_and_said_again():

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.world import motion
 
 COUNT = 20_000
 
@@ -26,6 +27,17 @@ def test_normal_distribution():
     assert draws.mean(-1).abs().max() < 5 / math.sqrt(COUNT)
     assert (draws.var(-1) - 1).abs().max() < 5 * math.sqrt(2 / COUNT)
     assert (draws.pow(4).mean(-1) - 3).abs().max() < 5 * math.sqrt(96 / COUNT)
+
+
+def test_random_points_fill_the_box():
+    low, high = torch.tensor([0.0, 0, 1]).double(), torch.tensor([29.0, 19, 4]).double()
+    points = motion.random_points(torch.arange(500), 4, low, high)
+    assert points.shape == (500, 4, 3)
+    assert points.dtype == torch.float32
+    flat = points.flatten(0, 1).double()
+    assert ((flat >= low) & (flat <= high)).all()
+    assert torch.allclose(flat.mean(0), (low + high) / 2, rtol=0.04)
+    assert torch.allclose(flat.std(0), (high - low) / math.sqrt(12), rtol=0.04)
 
 
 def correlation(a: torch.Tensor, b: torch.Tensor) -> float:

@@ -35,6 +35,8 @@ def test_every_method_has_the_same_pictures_besides_its_vector(method):
     assert keys.observation_keys(spec) == [keys.OBSERVATION, keys.CROPS]
     assert spec[keys.CROPS].shape == (2, 3, 2, 8, 8, 8)
     assert spec[keys.OBSERVATION].shape == (2, 3, 5 if method == "consensus" else 2)
+    more = make_env(method, num_uavs=3, **SMALL, **{"env.map.position": True}).observation_spec
+    assert more[keys.OBSERVATION].shape == (1, 3, 7 if method == "consensus" else 4)
 
 
 def test_without_a_radio_maps_equal_those_of_independent():

@@ -1,5 +1,6 @@
-"""Tests `env.sensor`: how well UAVs recognise cells depends on their altitude."""
+"""Tests what UAVs recognise (`env.sensor`), and what is new to them (`env.knowledge`)."""
 
+import itertools
 import math
 
 import pytest
@@ -17,12 +18,13 @@ from emberlink.trainers.replay.recording import Recorder
 
 ENVS, UAVS, STEPS, SIDE, WINDOW = 2, 3, 40, 12, 5
 NEAR, FAR = 0.9, 0.2
+COUNTS = (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE)
 
 
-def flown(hold: int = 1, **more):
+def flown(hold: int = 1, burn_time: float = 15, **more):
     generator = torch.Generator().manual_seed(4)
     arrival = 50 * torch.rand(ENVS, SIDE, SIDE, generator=generator)
-    fires = torch.stack((arrival, arrival + 15), 1)
+    fires = torch.stack((arrival, arrival + burn_time), 1)
     world = WildfireConfig(grid=(SIDE, SIDE), num_uavs=UAVS, horizon=STEPS, **more)
     env = WildfireEnv(ENVS, world, fires, seed=7, hold=hold)
     actions = 2 * torch.rand(STEPS // 2, ENVS, UAVS, 3, generator=generator) - 1
@@ -33,10 +35,19 @@ def flown(hold: int = 1, **more):
     return steps, fires
 
 
-@pytest.mark.parametrize("knowledge", ["team", "own"])
-def test_counts_are_those_of_a_scalar_twin(knowledge):
-    steps, fires = flown(sensor=(NEAR, FAR), knowledge=knowledge, observation="window", failures=1)
-    slope, missed = math.tan(math.radians(30)), 0
+@pytest.mark.parametrize(
+    ("knowledge", "chances", "burn_time", "failures"),
+    [
+        ("team", (NEAR, FAR), 15, 1),
+        ("own", (NEAR, FAR), 15, 1),
+        ("own", (1, 1), 1e9, 0),
+        ("own", (1, 1), 12, 3),
+    ],
+)
+def test_what_a_uav_recognises_is_that_of_a_scalar_twin(knowledge, chances, burn_time, failures):
+    world = {"knowledge": knowledge, "observation": "window", "failures": failures}
+    steps, fires = flown(burn_time=burn_time, sensor=chances, **world)
+    (near, far), slope, missed, new_to_one = chances, math.tan(math.radians(30)), 0, 0
     for env in range(ENVS):
         team, own = set(), [set() for _ in range(UAVS)]
         arrival, end = fires[env].tolist()
@@ -46,31 +57,42 @@ def test_counts_are_those_of_a_scalar_twin(knowledge):
             unit = counter_rng.uniform(key, UAVS * WINDOW**2).tolist()
             for uav in range(UAVS):
                 x, y, z = (float(c) for c in now[keys.POSITION][uav])
-                chance = NEAR + (FAR - NEAR) * (z - 1) / 3
-                counts = [0, 0, 0]
-                for a in range(WINDOW):
-                    for b in range(WINDOW):
-                        i, j = round(x) + a - 2, round(y) + b - 2
-                        if not (now[keys.ALIVE][uav] and 0 <= i < SIDE and 0 <= j < SIDE):
-                            continue
-                        if abs(i - x) > z * slope or abs(j - y) > z * slope:
-                            continue
-                        if unit[(uav * WINDOW + a) * WINDOW + b] >= chance:
-                            missed += 1
-                            continue
-                        burns = arrival[i][j] <= k < end[i][j]
+                chance = near + (far - near) * (z - 1) / 3
+                new, old, none = [], [], []
+                for a, b in itertools.product(range(WINDOW), range(WINDOW)):
+                    i, j = round(x) + a - 2, round(y) + b - 2
+                    if not (now[keys.ALIVE][uav] and 0 <= i < SIDE and 0 <= j < SIDE):
+                        continue
+                    if abs(i - x) > z * slope or abs(j - y) > z * slope:
+                        continue
+                    if unit[(uav * WINDOW + a) * WINDOW + b] >= chance:
+                        missed += 1
+                    elif not arrival[i][j] <= k < end[i][j]:
+                        none.append((i, j))
+                    else:
                         known = own[uav] if knowledge == "own" else team
-                        counts[2 if not burns else int((i, j) in known)] += 1
-                        if burns:
-                            team.add((i, j))
-                            own[uav].add((i, j))
-                found = [
-                    now[key][uav].item() for key in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE)
-                ]
-                assert found == counts
-                assert now[keys.WINDOW][uav].sum().item() == sum(counts)
+                        (old if (i, j) in known else new).append((i, j))
+                new_to_one += sum(cell in team for cell in new)
+                team.update(new)
+                own[uav].update(new)
+                found = [now[key][uav].item() for key in COUNTS]
+                assert found == [len(new), len(old), len(none)]
+                for key, cells in ((keys.NEW_CENTRE, new), (keys.OLD_CENTRE, old)):
+                    mean = [sum(c) / len(cells) for c in zip(*cells, strict=True)] or [0, 0]
+                    assert now[key][uav].tolist() == pytest.approx(mean, abs=1e-5)
+                assert now[keys.OBSERVATION][uav, 3:5].tolist() == [bool(new), bool(old)]
+                assert now[keys.WINDOW][uav].sum().item() == len(new) + len(old) + len(none)
             assert now[keys.SEEN].item() == len(team)
-    assert missed > 500
+    assert missed > 500 or chances == (1, 1)
+    assert (new_to_one > 0) == (knowledge == "own")
+
+
+def test_rewards_and_measures_are_those_of_the_team():
+    for own, team in zip(
+        *(flown(failures=2, knowledge=k)[0] for k in ("own", "team")), strict=True
+    ):
+        for key in (keys.REWARD, keys.SEEN, keys.BURNING, keys.POSITION, keys.NO_FIRE):
+            assert own[key].equal(team[key]), key
 
 
 def test_a_perfect_sensor_is_no_sensor():

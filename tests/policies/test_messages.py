@@ -5,10 +5,9 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 from emberlink.envs import keys
-from emberlink.policies.gaussian import MEMORY, GaussianActor
+from emberlink.policies.gaussian import GaussianActor
 from emberlink.policies.networks.messages import message_bytes
 from emberlink.policies.networks.sequence import GaussianNetwork
 from emberlink.policies.settings import PolicyConfig
@@ -153,22 +152,6 @@ def test_gradients_cross_uavs_as_finite_differences_say(scheme, memory, shared):
 
 
 @pytest.mark.parametrize(("scheme", "memory", "shared"), CASES)
-def test_nothing_crosses_a_missing_link(scheme, memory, shared):
-    net = network(scheme, memory, shared)
-    observed, hears = (
-        drawn(ENVS, 4, UAVS, FEATURES),
-        torch.zeros(ENVS, 4, UAVS, UAVS, dtype=torch.bool),
-    )
-    hears[:, :, 0, 1] = hears[:, :, 2, 3] = hears[:, :, 3, 2] = True
-    observed.requires_grad_()
-    mean, _ = net(net.empty_state(ENVS), observed, hears)
-    (gradient,) = torch.autograd.grad(mean[0, :, 0].sum(), observed)
-    reached = gradient.abs().sum((1, 3)) > 0
-    assert reached.tolist() == [[True, True, False, False], [False] * UAVS]
-    assert gradient[0, -1, 1].any(), "a message is read at the decision at which it is said"
-
-
-@pytest.mark.parametrize(("scheme", "memory", "shared"), CASES)
 def test_decision_by_decision_equals_the_sequence(scheme, memory, shared):
     net, observed, hears = network(scheme, memory, shared), drawn(ENVS, 6, UAVS, FEATURES), links(6)
     whole, _ = net(net.empty_state(ENVS), observed, hears)
@@ -202,23 +185,6 @@ def test_bytes_are_sent_at_decisions_by_those_that_fly(hold):
     decides = (rollout["next", keys.STEP] % hold == 0)[..., None]
     assert not alive.all()
     assert sent.equal(3 * (alive & decides))
-
-
-def test_the_actor_reads_the_links():
-    env = make_env("independent", "strong", message="mean", num_train_fires=2)
-    net = GaussianNetwork(
-        6, keys.observation_shapes(env.observation_spec), 3, (8,),
-        policy=PolicyConfig(memory="gru", message="mean"),
-    )  # fmt: skip
-    actor = GaussianActor(net, env.observation_spec)
-    assert keys.HEARS in actor.in_keys
-    first = env.reset()
-    given = first.select(*actor.in_keys, strict=False)
-    assert isinstance(given, TensorDict)
-    heard = given.clone().set(keys.HEARS, ~torch.eye(6, dtype=torch.bool).expand(1, 6, 6))
-    silent = given.clone().set(keys.HEARS, torch.zeros(1, 6, 6, dtype=torch.bool))
-    assert not actor(heard)[keys.ACTION].equal(actor(silent)[keys.ACTION])
-    assert ("next", *MEMORY) in heard.keys(True, True)
 
 
 def test_a_lost_message_contributes_nothing():

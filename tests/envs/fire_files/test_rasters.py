@@ -43,17 +43,6 @@ def test_a_raster_of_the_size_of_the_grid_is_read_cell_by_cell(tmp_path, write):
     assert torch.equal(fire, expected)
 
 
-def test_the_earliest_cell_within_a_coarse_cell_counts(tmp_path):
-    times = np.full((16, 24), -9999.0)
-    times[:2, :3] = [[9, 8, 4], [7, -9999, 6]]
-    times[15, 23] = 14
-    # A cell of the grid is 3 x 3 cells of the raster. 1 1/3 cells stay free below and above.
-    fire = read(write_asc(tmp_path / "fire.asc", times), horizon=10)
-    # The raster's rows 0 and 1 are the northern two of 16; the grid's rows of 3 begin 4 lower.
-    assert (fire[0, 6], fire[7, 1]) == (0, 10)  # the earliest of all six, 4 minutes, is step 0
-    assert torch.isfinite(fire).sum() == 2
-
-
 def test_times_of_a_coarser_raster_are_interpolated(tmp_path):
     times = np.full((4, 4), -9999.0)
     times[0, :3] = [0, 4, 8]
@@ -92,17 +81,11 @@ def test_bytes_with_nodata_scale_and_offset(tmp_path):
     ("keys", "expected"),
     [
         ({}, [0, 5, 10, 20]),
-        ({"start": 10.0}, [0, 0, 0, 20]),  # cells that burn by then burn at 0
-        ({"start": 5.0}, [0, 0, 20 / 3, 20]),
-        ({"end": 10.0}, [0, 10, 20, INF]),
-        ({"start": 5.0, "end": 10.0}, [0, 0, 20, INF]),
-        ({"minutes_per_step": 0.5}, [0, 10, 20, INF]),
+        ({"start": 5.0, "end": 10.0}, [0, 0, 20, INF]),  # cells that burn by then burn at 0
         ({"minutes_per_step": 2.0}, [0, 2.5, 5, 10]),
         ({"start": -10.0, "end": 30.0}, [5, 7.5, 10, 15]),
         ({"units": "hours", "minutes_per_step": 60.0}, [0, 5, 10, 20]),
-        ({"units": "seconds", "minutes_per_step": 1 / 60}, [0, 5, 10, 20]),
         ({"units": "days", "minutes_per_step": 1440.0, "start": 1.0}, [0, 4, 9, 19]),
-        ({"units": "steps"}, [0, 5, 10, 20]),
         ({"units": "steps", "end": 10.0}, [0, 10, 20, INF]),
     ],
 )
