@@ -7,7 +7,6 @@ import torch
 from torchrl.envs import step_mdp
 
 from emberlink.envs import keys
-from emberlink.envs.world import radio
 from emberlink.envs.world.coverage_map import with_burn_time
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
@@ -35,14 +34,13 @@ class Episode:
     """[radios, X, Y] at each step: the last step at which each cell was seen, -1 for never"""
     known: list[Any] = field(default_factory=list)
     """[radios] at each step: cells known to have burned"""
-    hears: list[Any] = field(default_factory=list)
-    """[radios, radios] at each step"""
     arrival: Any = None
     burn_out: Any = None
 
 
-def play_small(*overrides: str, seed: int = 5, member: int = 1, burn_time: float = 12.0) -> Episode:
+def play_small(*overrides: str) -> Episode:
     """Plays an episode of consensus in two environments and records one of them."""
+    seed, member, burn_time = 5, 1, 12.0
     config = resolve("consensus", [*LIMITED, *overrides])
     draw = torch.Generator().manual_seed(seed)
     x, y = torch.meshgrid(*(torch.arange(side) for side in config.env.grid), indexing="ij")
@@ -72,14 +70,6 @@ def _keep(episode: Episode, world: Any, now: Any, member: int) -> None:
     """Adds the environment's state at a step."""
     episode.steps.append(now)
     episode.fire_map.append(world.fire_map[member].clone())
-    knowledge = world.knowledge
-    if knowledge is None:
-        return
-    sensor = world._map._sensor
+    sensor, knowledge = world._map._sensor, world.knowledge
     episode.knowledge.append(sensor.crop(knowledge.last_seen[member]).clone())
     episode.known.append(knowledge.seen_fire[member].sum(-1))
-    batch = now[None]
-    position, alive = batch[keys.POSITION].double(), batch[keys.ALIVE]
-    measures = world._measures
-    given = position, measures._base[:1], batch[keys.RNG_KEY], batch[keys.STEP], alive
-    episode.hears.append(radio.links_with_base(episode.config.env.radio, *given)[0])

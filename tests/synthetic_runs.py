@@ -30,7 +30,6 @@ def write_run(
     fires: int = 4,
     learned: dict[str, Any] | None = None,
     scripted: tuple[str, ...] = ("random_actions", "random_waypoints"),
-    scenarios: tuple[str, ...] = ("huygens",),
 ) -> Path:
     """Writes a finished, evaluated run without checkpoints and returns its folder.
 
@@ -52,18 +51,15 @@ def write_run(
     ]
     (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     everyones = np.random.default_rng(7)
-    results: dict[str, Any] = {}
-    for scenario in scenarios:
-        given = {
-            m: np.broadcast_to(v, fires).astype(float).tolist() for m, v in (learned or {}).items()
-        }
-        results[scenario] = {
-            "learned": {m: (60 * generator.random(fires)).tolist() for m in metrics.NAMES} | given
-        }
-        for policy in scripted:
-            results[scenario][policy] = {
-                m: (60 * everyones.random(fires)).tolist() for m in metrics.NAMES
-            }
+    given = {
+        m: np.broadcast_to(v, fires).astype(float).tolist() for m, v in (learned or {}).items()
+    }
+
+    def drawn(generator: np.random.Generator) -> dict[str, list[float]]:
+        return {m: (60 * generator.random(fires)).tolist() for m in metrics.NAMES}
+
+    results = {"learned": drawn(generator) | given}
+    results |= {policy: drawn(everyones) for policy in scripted}
     write_evaluation(
         run,
         {
@@ -74,7 +70,7 @@ def write_run(
             "start_seed": 1,
             "checkpoint": "step_000000120.safetensors",
             "fires": fires,
-            "results": results,
+            "results": {"huygens": results},
         },
     )
     return run

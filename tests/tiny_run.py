@@ -13,13 +13,6 @@ TINY = [
         "evaluation.interval=0",
     ),
 ]
-PROGRAM = (
-    "import signal, sys\n"
-    # A background process may inherit that SIGINT is ignored.
-    "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    "from emberlink.trainers.cli.main import main\n"
-    "sys.exit(main())"
-)
 
 
 def train_tiny(output: Path) -> Path:

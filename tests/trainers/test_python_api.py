@@ -9,7 +9,7 @@ from hydra.core.global_hydra import GlobalHydra
 from tensordict.nn import TensorDictModule
 
 import emberlink.trainers as trainers
-from emberlink.envs import keys, metrics
+from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.runs.run_folder import RunFolder
 
@@ -58,21 +58,6 @@ def trained(tmp_path_factory):
     return runs[0]
 
 
-def test_train_writes_the_same_folder_as_the_command(trained):
-    assert trained.config.setup == "tuned"
-    assert trained.config.fire.name == "paper"
-    assert RunFolder(trained.path).config() == trained.config
-    assert len(RunFolder(trained.path).metrics()) == 2
-    written = json.loads((trained.path / "eval.json").read_text())
-    assert written["results"] == trained.results
-    assert list(trained.results) == ["huygens", "paper"]
-    for by_policy in trained.results.values():
-        assert list(by_policy) == ["learned", *POLICIES]
-        for measured in by_policy.values():
-            assert list(measured) == list(metrics.NAMES)
-            assert {len(values) for values in measured.values()} == {2}
-
-
 def test_an_exception_in_the_progress_ends_the_training(tmp_path):
     class Enough(Exception):
         pass
@@ -91,6 +76,8 @@ def test_evaluate_is_the_evaluation_of_the_training(trained):
     played = []
     results = trainers.evaluate(trained.path, progress=lambda *now: played.append(now))
     assert results == trained.results
+    assert results == json.loads((trained.path / "eval.json").read_text())["results"]
+    assert RunFolder(trained.path).config() == trained.config
     assert ("paper", "learned") in played
     alone = trainers.evaluate(str(trained.path), episodes=1, scripted=False, device="cpu")
     assert alone["huygens"].keys() == {"learned"}
@@ -117,33 +104,6 @@ def test_load_gives_the_trained_policy_and_its_environment(trained):
     assert again(rollout[:, 0].clone())[keys.ACTION].equal(rollout[:, 0][keys.ACTION])
     larger = trainers.make_env(policy.config, grid=[40, 20], fire="huygens")
     assert larger.rollout(1, policy)[keys.ACTION].shape == (1, 1, 2, 3)
-
-
-def test_compare_gives_the_numbers(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    comparison = trainers.compare(["pretrained:tuned"])
-    assert len(comparison.sections) == 1
-    ranking = comparison.ranking
-    coverage = ranking[ranking["measure"] == "coverage"].set_index("label")["iqm"]
-    assert coverage.index[0] == "consensus"
-    assert coverage["oracle"] > coverage["consensus"] > 90
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda run: trainers.train("consensu"), "did you mean consensus"),
-        (lambda run: trainers.evaluate(run.parent), "a folder of 1 runs; choose one: .*consensus"),
-        (lambda run: trainers.load(run, checkpoint="nowhere.safetensors"), "nowhere.safetensors"),
-    ],
-)
-def test_errors_equal_those_of_the_commands(call, message, trained, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match=message) as error:
-        call(trained.path)
-    assert "\n" not in str(error.value)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_hydra_state_of_a_program_is_kept(tmp_path):

@@ -14,44 +14,29 @@ HOME = ["~nobody_here", "home folder"]
 TRAININGS = [
     ("consensu", ["'consensu'", "did you mean consensus?", METHODS]),
     ("consensus maps", ["'maps'", "emberlink sweep consensus maps"]),
-    ("consensus learner.gama=0.9", ["'learner.gama'", "did you mean learner.gamma?"]),
-    ("consensus lr=0.1", ["'lr'", "learner.actor_lr or learner.critic_lr"]),
-    ("independent learner=ippo learner.tau=0.1", ["'learner.", "known: learner.name"]),
-    ("independent world=fornt", ["world 'fornt'", "did you mean front?"]),
     ("independent env.failures=2.5", ["env.failures=2.5", "the team has 2 UAVs"]),
     ("independent evaluation.scripted=[orcale]", ["orcale", "did you mean oracle?"]),
-    ("consensus learner.batch_size=1.5", ["learner.batch_size=1.5", "integer"]),
     ("consensus learner.buffer_size=5", ["batch_size=8", "buffer_size=5"]),
-    ("maps comm.range=0", ["'comm.range'", "did you mean env.radio.range?"]),
     ("consensus comm.name=telepathy", ["telepathy", "known: consensus, maps, no_comm"]),
     ("consensus seed=1,2", ["'seed=1,2'", "one value", "emberlink sweep"]),
     ("consensus env.horizon=${nope}", ["nope", "env.horizon"]),
 ]
 COMMANDS = [
-    ("trian", ["'trian'", "did you mean train?"]),
     ("train", ["required: METHOD ("]),
     ("train independent --episodes 5", ["--episodes", "key=value"]),
     ("eval RUN --chekpoint x", ["did you mean --checkpoint?"]),
-    ("eval RUN --fires 65537", ["'65537' is not a whole number from 1 to 65536"]),
     ("eval pretrained:maps evaluation.message_fault=zero", ["no learned messages"]),
-    ("list method", ["known: methods, setups"]),
-    ("sweep consensus learner.gama=0.9,0.8", ["learner.gama"]),
     ("sweep consensus seed=range(3,3)", ["no run: a key has no value"]),
     ("sweep consensus output=a,b", ["a sweep has one output folder"]),
     ("sweep executor=slurm", ["executor='slurm' is not known; known: local"]),
-    ("sweep executor.nodes=2", ["'executor.nodes' is not known"]),
-    ("sweep executor=submitit executor.time=soon", ["executor.time="]),
-    ("world check mars", ["world 'mars'", "known: blackout, file"]),
     ("world check front evaluation.scripted=[oracle]", ["lacks random_way"]),
     ("world check front --json out.txt", ["must end in .json"]),
-    ("train consensus learner=imitation", ["env.observation=vector: the teacher"]),
     ("train maps env.observation=vector", ["comm.name=maps exchanges the UAVs' maps"]),
     (f"{IMITATE} learner.teacher=courier", ["known: map_greedy"]),
     (f"{IMITATE} learner.samples=9 learner.buffer_size=8", ["buffer_size=8"]),
     ("train maps learner=ippo learner.warm_start=no", ["learner.warm_start=no:"]),
     (f"train independent output={NOWHERE}", HOME),
     (f"train independent world=file setup=tuned fire.path={NOWHERE}", HOME),
-    (f"eval {NOWHERE}", HOME),
     (f"compare {NOWHERE}", HOME),
 ]
 
@@ -73,12 +58,7 @@ def test_a_mistake_is_one_line_and_leaves_no_files(arguments, words, tmp_path, m
 
 @pytest.mark.parametrize(
     ("wrong", "seconds"),
-    [
-        ("nosuchmethod", 1),
-        ("independent x=1", 2),
-        ("independent seed=-1", 2),
-        ("independent learner.tau=fast", 2),
-    ],
+    [("nosuchmethod", 1), ("independent x=1", 2), ("independent learner.tau=fast", 2)],
 )
 def test_a_wrong_name_or_value_is_answered_without_torch(wrong, seconds):
     program = (

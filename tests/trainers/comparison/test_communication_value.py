@@ -1,7 +1,6 @@
 """Tests the value of communication on numbers that were computed by hand."""
 
 import json
-import warnings
 
 import pytest
 from synthetic_runs import read_evaluation, write_run
@@ -68,6 +67,16 @@ def test_networks_trained_with_other_radios(tmp_path):
     )
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_resample_without_anything_to_gain_leaves_no_interval(tmp_path):
+    """On the first of four fires there is none; one resample in 256 draws only this fire."""
+    run = write_run(tmp_path, learned={"coverage": [55.0, 60.0, 60.0, 60.0]})
+    evaluate_otherwise(run, 0.0, [50.0] * 4)
+    evaluate_otherwise(run, float("inf"), [50.0, 70.0, 70.0, 70.0])
+    (row,) = values(tmp_path)
+    assert (row["value"], interval(row, "value")) == (35 / 60, (None, None))
+
+
 def test_a_value_is_undetermined_where_no_limits_may_gain_nothing(tmp_path):
     run = write_run(tmp_path, learned={"coverage": [60.0, 60, 60, 60]})
     evaluate_otherwise(run, 0.0, [50.0, 50, 50, 50])
@@ -124,17 +133,6 @@ def test_with_a_base_scripted_policies_need_the_other_radios(tmp_path):
         ("courier", 45.0, 85.0, 95.0, 0.8),
     ]
     assert not any("does not have the same" in note for note in compared.notes)
-
-
-def test_a_resample_without_anything_to_gain_leaves_no_interval(tmp_path):
-    """On the first of four fires there is none; one resample in 256 draws only this fire."""
-    run = write_run(tmp_path, learned={"coverage": [55.0, 60.0, 60.0, 60.0]})
-    evaluate_otherwise(run, 0.0, [50.0, 50.0, 50.0, 50.0])
-    evaluate_otherwise(run, float("inf"), [50.0, 70.0, 70.0, 70.0])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        (row,) = values(tmp_path)
-    assert (row["value"], interval(row, "value")) == (35 / 60, (None, None))
 
 
 def test_without_a_base_map_greedy_plays_as_alone_and_as_all_with_the_other_radios():

@@ -220,8 +220,11 @@ def test_other_evaluations_are_not_counted_as_runs(comparison, runs, tmp_path):
     evaluate_otherwise(run, "eval_step_7.json")
     content = json.loads((run / "eval_step_7.json").read_text())
     (run / "eval_step_7.json").write_text(json.dumps(content | {"checkpoint": "step_7"}))
+    content = read_evaluation(run) | {"message_fault": "zero"}
+    (run / "eval_fault.json").write_text(json.dumps(content))
     found = compare_runs([run])
-    assert sorted(found.runs["label"]) == ["consensus", LOST]
+    named = "consensus, evaluated with evaluation.message_fault=zero"
+    assert sorted(found.runs["label"]) == ["consensus", LOST, named]
     assert {path.rpartition("/")[2] for path, _ in found.left_out} == {
         run.name,  # the same settings twice
         "eval_step_7.json",
@@ -231,30 +234,16 @@ def test_other_evaluations_are_not_counted_as_runs(comparison, runs, tmp_path):
 # Scripted policies, rewards
 
 
-def scripted(comparison, measure="coverage"):
-    ranking = comparison.ranking
-    ranking = ranking[(ranking["measure"] == measure) & (ranking["policy"] == "random_actions")]
-    return dict(zip(ranking["label"], ranking["iqm"], strict=True))
-
-
-def test_evaluations_with_a_fault_of_messages_are_rows(tmp_path):
-    run = write_run(tmp_path, "independent", overrides=("learner=mappo", "policy.message=mean"))
-    content = read_evaluation(run) | {"message_fault": "zero"}
-    (run / "eval_evaluation.message_fault=zero.json").write_text(json.dumps(content))
-    (rows,) = labels(tmp_path).values()
-    named = "independent, evaluated with evaluation.message_fault=zero"
-    assert list(rows) == ["independent", named]
-
-
 def test_scripted_policies_have_rows_of_their_own(tmp_path):
     for seed in range(2):
         for method, run in ((m, write_run(tmp_path, m, seed)) for m in ("consensus", "positional")):
             change_policy(run, "random_actions", "coverage", 5.0)
             if method == "positional":
                 change_policy(run, "random_actions", "mean_reward", 7.0)
-    comparison = compare_runs([tmp_path])
-    assert scripted(comparison) == {"random actions": 5.0}
-    assert scripted(comparison, "mean_reward")["random actions (positional)"] == 7.0
+    ranking = compare_runs([tmp_path]).ranking
+    rows = ranking[ranking["policy"] == "random_actions"].set_index(["measure", "label"])["iqm"]
+    assert rows["coverage"].to_dict() == {"random actions": 5.0}
+    assert rows["mean_reward", "random actions (positional)"] == 7.0
 
 
 def test_different_rewards_are_not_ranked(tmp_path):
@@ -285,19 +274,9 @@ def test_difference_by_hand(comparison):
     assert ends == crossed_interval(iqm_difference, first, second)
     assert p == crossed_p(iqm_difference, first, second)
     assert comparison.difference(LOST, "positional", "coverage") == (31 - 20, None, None)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "why"),
-    [
-        (("consensu", "positional", "coverage"), "label 'consensu' is not known"),
-        (("consensus", "positional", "mean_reward"), "rewards differ"),
-        (("consensus", LOST, "coverage"), "are evaluations of the same runs"),
-    ],
-)
-def test_errors_of_a_difference(comparison, arguments, why):
-    with pytest.raises(UserError, match=why):
-        comparison.difference(*arguments)
+    for wrong in (("consensu", "coverage"), ("positional", "mean_reward"), (LOST, "coverage")):
+        with pytest.raises(UserError, match=r"is not known|rewards differ|same runs"):
+            comparison.difference("consensus", *wrong)
 
 
 # The paper's claims

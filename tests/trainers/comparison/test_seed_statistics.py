@@ -44,21 +44,6 @@ def plain_interval(statistic, *samples) -> tuple[float, float]:
     return float(np.quantile(values, 0.025)), float(np.quantile(values, 0.975))
 
 
-@pytest.mark.parametrize(
-    ("values", "expected"),
-    [
-        ([7], 7),
-        ([1, 3], 2),
-        ([1, 2, 9], 4),
-        ([0, 1, 3, 100], 2),
-        ([0, 1, 3, 5, 100], 3),
-        ([8, 7, 6, 5, 4, 3, 2, 1], 4.5),
-    ],
-)
-def test_iqm_of_few_seeds(values, expected):
-    assert iqm(np.asarray(values, float)) == expected
-
-
 @settings(deadline=None)
 @given(numbers, numbers)
 def test_statistics_equal_plain_python(sample, reference):

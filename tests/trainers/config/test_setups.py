@@ -8,11 +8,9 @@ import pytest
 from emberlink.comm.consensus import ConsensusConfig
 from emberlink.envs.config import RewardConfig, WildfireConfig
 from emberlink.envs.utils.config_files import known
-from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import build_comm
-from emberlink.trainers.config.values import REMOVED, check_not_removed
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 PAPER, RELEASED = "paper", "released"
@@ -149,10 +147,3 @@ def test_every_key_of_a_configuration_can_be_set(choice):
     }
     assert {"env.reward.base", "env.radio.range"} <= values.keys()
     assert resolve("maps", chosen, **values) == config
-
-
-@pytest.mark.parametrize("key", REMOVED)
-def test_a_removed_key_is_named_with_what_replaces_it(key):
-    name, _, value = key.partition("=")
-    with pytest.raises(UserError, match="is no longer a setting: "):
-        check_not_removed(name, value or None)

@@ -11,7 +11,6 @@ from test_recipes import METHODS
 from torchrl.envs import check_env_specs
 
 from emberlink.trainers import make_env
-from emberlink.trainers import resume as resume_and_finish
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs import checkpoint
@@ -236,12 +235,6 @@ def test_the_command_resumes_and_reports_a_finished_run(paused, whole, capsys):
     (paused / "eval.json").unlink()
     assert main.main(["train", f"resume={paused}"]) == 0
     assert RunFolder(paused).evaluated()
-
-
-def test_the_function_resumes_and_evaluates(paused):
-    run = resume_and_finish(paused, episodes=3)
-    assert len(RunFolder(paused).metrics()) == run.config.episodes == 3
-    assert run.results["huygens"]["learned"]["coverage"]
 
 
 def test_folders_that_cannot_be_resumed(paused, tmp_path, capsys):
