@@ -10,11 +10,11 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from statistics import median
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from workloads import in_turns
 
 from emberlink.envs import keys
 from emberlink.trainers.build import build_env
@@ -70,16 +70,11 @@ def batches_of(setup: TrainingSetup) -> list[TensorDictBase]:
     return batches
 
 
-def seconds(device: str, work: Callable[[], object], rounds: int = 3) -> float:
-    """Returns the median wall time of a function, without the first call."""
-    taken = []
-    for _ in range(rounds + 1):
-        began = time.perf_counter()
-        work()
-        if device != "cpu":
-            torch.cuda.synchronize()
-        taken.append(time.perf_counter() - began)
-    return median(taken[1:])
+def finished(device: str, work: Callable[[], object]) -> None:
+    """Calls a function and waits for the device."""
+    work()
+    if device != "cpu":
+        torch.cuda.synchronize()
 
 
 def difference(ours: Any, theirs: Any) -> float:
@@ -103,7 +98,7 @@ def main(device: str, episodes: int) -> int:
         agree.append(tell(f"{method}: 300 steps", difference(ours, theirs)))
         for num_envs in (64, 1024) if method != "maps" else (64,):
             flights = [partial(fly, env_of(method, at, num_envs), 10) for at in both]
-            cpu, other = map(seconds, both, flights)
+            cpu, other = in_turns(3, *map(partial(partial, finished), both, flights))
             print(
                 f"{method}: {num_envs} environments, 100 steps: {other:.2f} s, x {cpu / other:.2f}"
             )
@@ -116,7 +111,7 @@ def main(device: str, episodes: int) -> int:
         updates = [
             partial(updated, s.learner, batches, at) for s, at in zip(setups, both, strict=True)
         ]
-        cpu, other = map(seconds, both, updates)
+        cpu, other = in_turns(3, *map(partial(partial, finished), both, updates))
         print(f"{method}: these updates: {other:.2f} s, x {cpu / other:.2f}")
     coverage, taken = [], []
     for at in both:

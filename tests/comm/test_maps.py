@@ -150,28 +150,6 @@ def test_lost_messages_are_counted_and_said_again():
     assert 1 < most < 40
 
 
-def flight_of(envs: range, **world) -> list:
-    """Flies in some of four environments with different fires."""
-    fire = torch.cat([burning(seed, 20) for seed in range(4)])
-    generator = torch.Generator().manual_seed(0)
-    position = torch.rand(4, 3, 3, generator=generator) * 12 + 3
-    position[..., 2] = 3.0
-    chosen = list(envs)
-    env = environment(fire[chosen], position[chosen], **world)
-    return fly(env, position[chosen], random_flight(25, 3, 4)[:, chosen])
-
-
-def test_a_batch_equals_single_environments():
-    radio = RadioConfig(bandwidth=64)
-    together = flight_of(range(4), radio=radio)
-    for env in range(4):
-        for step, alone in enumerate(flight_of(range(env, env + 1), radio=radio)):
-            for key in (*OBSERVED, keys.BYTES_SENT):
-                assert together[step][key][env].equal(alone[key][0])
-    assert together[-1][keys.CROPS].any()
-    assert 5 <= max(td[keys.BYTES_SENT].max() for td in together) <= 64
-
-
 def test_failed_uavs_neither_see_nor_hear():
     position = torch.tensor([[[14.0, 15.0, 4.0], [15.0, 15.0, 4.0], [16.0, 15.0, 4.0]]])
     env = environment(burning(), position, failures=3.0)

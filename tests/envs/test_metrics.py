@@ -6,8 +6,6 @@ import torch
 from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
 from emberlink.trainers import make_env
 
-YES, NO = True, False
-
 
 def test_what_the_base_knows_is_averaged_over_steps():
     seen, burnt = torch.tensor([0, 0, 10, 30]), torch.tensor([20, 40, 40, 40])
@@ -36,14 +34,6 @@ def test_coverage_without_fire_is_complete():
     nothing = torch.zeros(3, dtype=torch.int64)
     assert metrics.coverage(nothing, nothing).item() == 100
     assert metrics.coverage_auc(nothing, nothing).item() == 100
-
-
-def test_a_uav_that_never_finds_fire_has_the_horizon():
-    on_fire = torch.zeros(5, 3, dtype=torch.bool)
-    assert metrics.tracking_first(on_fire).item() == 5
-    on_fire[0, 1] = on_fire[2, 0] = YES
-    assert metrics.tracking_first(on_fire).item() == 1
-    assert metrics.tracking_last(on_fire).item() == 5
 
 
 def by_hand(steps) -> dict[str, float]:

@@ -42,11 +42,8 @@ def test_pettingzoo_parallel_api():
     parallel_api_test(parallel_env(config=config, fire=FIRE), num_cycles=100)
 
 
-def test_pettingzoo_seeds():
+def test_pettingzoo_seeds_cycles_and_state():
     parallel_seed_test(small, num_cycles=100)
-
-
-def test_pettingzoo_max_cycles_and_state():
     max_cycles_test(pettingzoo)
     state_test(parallel_to_aec(small()), small(), num_cycles=20)
 

@@ -41,22 +41,6 @@ def counts(td: TensorDict) -> list[tuple[int, int, int]]:
     return list(zip(*columns, strict=True))
 
 
-def rewards(td: TensorDict) -> list[float]:
-    return td[keys.REWARD][0, :, 0].tolist()
-
-
-def test_the_first_of_two_uavs_over_the_same_cells_discovers():
-    env = world(num_uavs=2)
-    start(env, [3.0, 3, 2], [3, 3, 2])
-    td = act(env)  # 2 tan 30 = 1.15: cells 2, 3 and 4 along x and y
-    assert counts(td) == [(9, 0, 0), (0, 9, 0)]
-    assert rewards(td) == [9, -36]
-    assert counts(act(env)) == [(0, 9, 0), (0, 9, 0)]
-    assert env.fire_map[0, 2:5, 2:5].eq(1).all()
-    assert env.fire_map.eq(1).sum() == 9
-    assert env.fire_map.eq(2).sum() == 144 - 9
-
-
 def test_box_observation_is_scaled():
     env = world(grid=(12, 12), observation_scale="box")
     td = start(env, [0.0, 5.5, 4])
@@ -77,19 +61,6 @@ def test_an_altitude_that_float32_rounds_down_is_in_the_box():
     env = world(altitude=(3.3, 4.1))
     start(env, [5.0, 5, 3.3])
     assert not act(env)[keys.HIT_BOUNDARY].any()
-
-
-def test_reset_starts_in_the_box_without_seen_cells():
-    env = world(num_envs=200, num_uavs=3, altitude=(2.0, 3.0))
-    env.rollout(5)
-    td = env.reset()
-    position = td[keys.POSITION]
-    low, high = torch.tensor(env.config.low), torch.tensor(env.config.high)
-    assert ((position >= low) & (position <= high)).all()
-    for key in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE, keys.SEEN, keys.STEP):
-        assert not td[key].any(), key
-    assert not td[keys.OBSERVATION][..., 3:].any()
-    assert env.fire_map.eq(2).all()
 
 
 def test_fire_by_name_by_config_and_by_arrival_times():
@@ -119,19 +90,19 @@ def test_fires_of_a_bank_are_drawn_each_episode(name):
     assert not torch.equal(fires[0], fires[1])
 
 
-def test_an_environment_does_not_depend_on_the_batch_size():
-    scenario = dataclasses.replace(load_scenario("huygens"), num_train_fires=5)
-    single, five = world(scenario, 1, seed=3), world(scenario, 5, seed=3)
-    action = torch.rand(5, 1, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+@pytest.mark.parametrize("method", METHODS)
+def test_an_environment_does_not_depend_on_the_batch_size(method):
+    more = {"fire": "huygens", "num_train_fires": 5, "grid": [12, 12], "num_uavs": 3, "seed": 3}
+    single, five = (make_env(method, num_envs=count, **more) for count in (1, 5))
+    action = torch.rand(5, 3, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
     for _ in range(3):
         alone, among = single.reset(), five.reset()
         assert (alone == among[:1]).all()
-        assert torch.equal(single.arrival_time, five.arrival_time[:1])
         for _ in range(4):
-            alone = single.step(TensorDict({keys.ACTION: action[:1]}, [1]))["next"]
-            among = five.step(TensorDict({keys.ACTION: action}, [5]))["next"]
+            alone = single.step(alone.set(keys.ACTION, action[:1]))["next"]
+            among = five.step(among.set(keys.ACTION, action))["next"]
             assert (alone == among[:1]).all()
-            assert torch.equal(single.fire_map, five.fire_map[:1])
+            assert torch.equal(single.base_env.fire_map, five.base_env.fire_map[:1])
 
 
 @pytest.mark.filterwarnings("error")

@@ -16,11 +16,12 @@ from emberlink.policies.networks.encoders import (
 UAVS, ACTIONS, WINDOW, HIDDEN = 3, 3, 5, (10, 8)
 
 
-def specs(envs: int, *, window: bool) -> tuple[Composite, Composite]:
-    observation = {keys.OBSERVATION: Unbounded((envs, UAVS, 9))}
-    if window:
-        shape = torch.Size((envs, UAVS, 3, WINDOW, WINDOW))
-        observation[keys.WINDOW] = Binary(shape=shape, dtype=torch.bool)
+def specs(envs: int) -> tuple[Composite, Composite]:
+    window = torch.Size((envs, UAVS, 3, WINDOW, WINDOW))
+    observation = {
+        keys.OBSERVATION: Unbounded((envs, UAVS, 9)),
+        keys.WINDOW: Binary(shape=window, dtype=torch.bool),
+    }
     action = {keys.ACTION: Bounded(-1, 1, (envs, UAVS, ACTIONS))}
     return Composite(observation, shape=(envs,)), Composite(action, shape=(envs,))
 
@@ -71,7 +72,7 @@ class PlainActor(nn.Module):
 @pytest.mark.parametrize("hidden", [(10,), (10, 8), (6, 10, 8)])
 @torch.no_grad()
 def test_window_and_vector_equal_a_plain_network(shared, hidden):
-    observation, action = specs(4, window=True)
+    observation, action = specs(4)
     actor = scrambled(make_actor(observation, action, hidden, share_parameters=shared))
     td = observed(4, UAVS)
     actions = actor(td.clone())[keys.ACTION]

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torchrl.envs import TransformedEnv, check_env_specs, step_mdp
 
-from emberlink.comm.base import CommModule, Communication
-from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
+from emberlink.comm.base import Communication
+from emberlink.envs import WildfireEnv, keys, metrics
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.hold import HELD, Held, held
 from emberlink.policies.state import Stateful
@@ -131,27 +131,6 @@ def test_a_held_action_equals_its_steps_one_by_one(method, world):
     assert measured[0].keys() == measured[1].keys()
     for name, value in measured[0].items():
         assert value.equal(measured[1][name]), name
-
-
-class Listening(CommModule):
-    """Counts the steps at which it is called."""
-
-    def __init__(self, every_step: bool):
-        super().__init__(WildfireConfig(), None, 2)
-        self.every_step = every_step
-        self.register_buffer("calls", torch.zeros(2, dtype=torch.int64))
-
-    def forward(self, tensordict):
-        self.calls.add_(1)
-        return tensordict
-
-
-@pytest.mark.parametrize(("every_step", "calls"), [(True, 9), (False, 3)])
-def test_a_module_takes_part_in_every_step_unless_it_says_otherwise(every_step, calls):
-    module = Listening(every_step)
-    env = TransformedEnv(WildfireEnv(2, hold=4, seed=0), Communication(module))
-    env.rollout(2)
-    assert module.calls.tolist() == [calls] * 2
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -86,37 +86,33 @@ def base_world(**settings) -> WildfireConfig:
     return WildfireConfig(**given | {"base": (0.0, 20.0)} | settings)
 
 
+FAR_FIRE = torch.full((40, 40), NEVER)
+FAR_FIRE[24:31, 16:25] = 0
+NEAR_IT = [[26.0, 20, 4], [25.0, 22, 4], [28.0, 18, 4]]
+
+
 @pytest.mark.parametrize("kind", [Courier, Oracle])
 def test_what_was_seen_is_at_the_base_in_the_end(kind):
-    fire = torch.full((40, 40), NEVER)
-    fire[24:31, 16:25] = 0
-    env = WildfireEnv(1, base_world(), fire, seed=1)
-    start = [[26.0, 20, 4], [25.0, 22, 4], [28.0, 18, 4]]
-    td = played(env, kind(env), 60, start)
+    env = WildfireEnv(1, base_world(), FAR_FIRE, seed=1)
+    td = played(env, kind(env), 60, NEAR_IT)
     assert td[keys.BASE_SEEN].item() == 0
-    td = played(env, kind(env), 90, start)
+    td = played(env, kind(env), 90, NEAR_IT)
     assert td[keys.BASE_SEEN].item() == td[keys.SEEN].item() == 63
-    td = played(env, MapGreedy(env), 90, start)
+    td = played(env, MapGreedy(env), 90, NEAR_IT)
     assert td[keys.BASE_SEEN].item() == 0
 
 
 @pytest.mark.parametrize("kind", [Shuttle, ShuttleAll, OracleShuttle])
 def test_shuttles_report_in_the_middle_of_an_episode(kind):
-    fire = torch.full((40, 40), NEVER)
-    fire[24:31, 16:25] = 0
-    env = WildfireEnv(1, base_world(horizon=300), fire, seed=1)
-    start = [[26.0, 20, 4], [25.0, 22, 4], [28.0, 18, 4]]
-    td = played(env, kind(env), 250, start)
+    env = WildfireEnv(1, base_world(horizon=300), FAR_FIRE, seed=1)
+    td = played(env, kind(env), 250, NEAR_IT)
     assert td[keys.BASE_SEEN].item() == td[keys.SEEN].item() == 63
-    assert played(env, Courier(env), 250, start)[keys.BASE_SEEN].item() == 0
+    assert played(env, Courier(env), 250, NEAR_IT)[keys.BASE_SEEN].item() == 0
 
 
 def test_the_chain_closes_where_a_uav_has_failed():
-    fire = torch.full((40, 40), NEVER)
-    fire[24:31, 16:25] = 0
-    env = WildfireEnv(1, base_world(failures=1.0, horizon=230), fire, seed=1)
-    start = torch.tensor([[26.0, 20, 4], [25.0, 22, 4], [28.0, 18, 4]])
-    td, courier = env.reset(position=start), Courier(env)
+    env = WildfireEnv(1, base_world(failures=1.0, horizon=230), FAR_FIRE, seed=1)
+    td, courier = env.reset(position=torch.tensor(NEAR_IT)), Courier(env)
     env._fail_step.copy_(torch.tensor([[20, 231, 231]]))  # UAV 0 would be next to the base
     for _ in range(230):
         td = step_mdp(env.step(courier(td)), keep_other=True)

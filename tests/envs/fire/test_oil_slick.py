@@ -136,12 +136,3 @@ def test_oil_that_leaves_the_grid_returns():
     assert late[8:].sum() > 10
     without = arrival_times(start(11.0), (15, 24), *rates, **options)[0]
     assert (without.isfinite() != wide.isfinite()).sum() > 5
-
-
-def test_all_of_the_disc_is_oil():
-    """A ring as wide as its radius has no hole."""
-    x, y = torch.meshgrid(torch.arange(30.0), torch.arange(30.0), indexing="ij")
-    for arrival in make_fires(load_scenario("oil_slick"), fire_seeds("test", 10), GRID, 50):
-        oil = (arrival == 0).nonzero().float()
-        cx, cy = (oil.amax(0) + oil.amin(0)) / 2
-        assert (arrival[torch.hypot(x - cx, y - cy) < 3.5] == 0).all()

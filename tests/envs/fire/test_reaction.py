@@ -63,15 +63,6 @@ def test_times(fires: torch.Tensor):
     assert burning.min() > 40
 
 
-def test_a_fire_depends_on_its_seed_only(fires: torch.Tensor):
-    seeds, state = fire_seeds("test", 12), torch.get_rng_state()
-    some = torch.tensor([9, 0, 4])
-    assert torch.equal(reaction_fires(CONFIG, seeds[some], GRID, HORIZON), fires[some])
-    assert torch.equal(reaction_fires(CONFIG, seeds[9:10], GRID, HORIZON), fires[9:10])
-    assert torch.equal(torch.get_rng_state(), state)
-    assert len(fires[:, 0].flatten(1).unique(dim=0)) == 12
-
-
 @pytest.mark.parametrize(("azimuth", "axis", "sign"), [(0, 0, 1), (90, 1, 1), (180, 0, -1)])
 def test_the_head_runs_with_the_wind(azimuth: float, axis: int, sign: int):
     still = {"wind_shift": (0.0, 0.0), "centre_x": (0.5, 0.5), "centre_y": (0.5, 0.5)}

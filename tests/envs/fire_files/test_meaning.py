@@ -77,7 +77,7 @@ def test_a_time_of_day_of_another_column_is_asked_for(tmp_path, elapsed):
     asks(tmp_path / "wrong.gpkg", "date and time=.2020-09-05 2575. is not a date")
 
 
-@pytest.mark.parametrize("column", ["fireid", "FIRE_YEAR", "attr_UniqueFireIdentifier", "id"])
+@pytest.mark.parametrize("column", ["fireid", "FIRE_YEAR", "IRWINID", "id"])
 def test_several_fires_are_listed_and_one_is_chosen(tmp_path, elapsed, column):
     frames = [squares(200, 300, 400, date=dates(3)), squares(9, 90, at=(9e4, 0), date=dates(2))]
     frame = pandas.concat([f.assign(**{column: k + 2019}) for k, f in enumerate(frames)])

@@ -3,12 +3,9 @@
 import re
 
 import numpy as np
-import pandas
 import pytest
 import torch
 from fire_files import Ellipses, answered, raster_of, squares, write_asc, write_tif
-from rasterio import Affine
-from scipy.io import netcdf_file
 
 TIMES = raster_of(Ellipses(), 300.0)
 BURNS = TIMES >= 0
@@ -28,13 +25,6 @@ def raster(values, **about):
     return lambda folder: write_tif(folder / "fire.tif", values, **{"nodata": None, **about})
 
 
-def two_fires(folder):
-    near = squares(200, 300, 400, date=DAYS, IRWINID=["{A}"] * 3)
-    far = squares(90, 180, 270, at=(9e4, 0), date=DAYS, IRWINID=["{B}"] * 3)
-    pandas.concat([near, far]).to_file(folder / "fire.shp")
-    return folder / "fire.shp"
-
-
 def in_names(folder):
     areas = squares(200, 300, 400).to_crs("EPSG:4326").geometry
     marks = ""
@@ -44,15 +34,6 @@ def in_names(folder):
         marks += "</coordinates></LinearRing></Placemark>"
     (folder / "fire.kml").write_text(KML.format(marks))
     return folder / "fire.kml"
-
-
-def in_seconds(folder):
-    with netcdf_file(folder / "fire.nc", "w") as file:
-        file.createDimension("y", 100)
-        file.createDimension("x", 100)
-        variable = file.createVariable("arrival", "f4", ("y", "x"))
-        variable[:], variable.units = np.where(BURNS, TIMES * 60, -1), "seconds"
-    return folder / "fire.nc"
 
 
 def states(folder):
@@ -81,19 +62,9 @@ CASES = {
         table("fire.gpkg", date=[DAYS[0], DAYS[0], DAYS[1]], flight=["AM", "PM", "AM"]),
         ({}, r"fire.time_field=\[date,flight\]", "3 times, from 2020-08-20T00:00"),
     ),
-    "2 identifiers": (two_fires, ({}, r"IRWINID: \{A\} \(3\), \{B\} \(3\)", "3 of 6 features")),
     "3 status": (
         table("fire.geojson", date=DAYS, status=["final", "final", "draft"]),
         ({}, r"status: final \(2\), draft \(1\)", "2 of 3 features used"),
-    ),
-    "4 degrees far north": (
-        raster(
-            TIMES,
-            crs="EPSG:4326",
-            transform=Affine(0.0009, 0, 10, 0, -0.00045, 60.03),
-            nodata=-9999,
-        ),
-        ({"units": "minutes"}, "", "UTM zone 32N .axes 1.00 : 1"),
     ),
     "5 end and five seconds": (
         raster(np.where(BURNS, TIMES, 305)[25:75, 25:75]),
@@ -104,15 +75,6 @@ CASES = {
         table("fire.gpkg", doy=[364, 365, 1]),
         ({"time_field": "doy", "units": "days"}, "units=day_of_year", "364 days to 366 days"),
     ),
-    "7 day first, with dashes": (
-        table("fire.gpkg", date=["05-08-2020", "06-08-2020", "07-08-2020"]),
-        ({}, "fire.time_format=day_first", "2020-08-05.* 2020-08-07"),
-    ),
-    "7 ten digits": (
-        table("fire.gpkg", timestamp=["1508191300", "1508191400", "1508191500"]),
-        ({}, r"seconds \(2017-10-16 22:01\) or %y%m%d%H%M \(2015", "2017-10-16|2015-08-19"),
-    ),
-    "8 declared": (in_seconds, ({"units": "hours"}, "is in seconds", "arrival")),
     "9 states in bands": (states, ({}, "15|16 bands; .*fire.kind=masks", "to 15 maps")),
     "11 shrinking": (
         table("fire.gpkg", date=[DAYS[2], DAYS[1], DAYS[0]]),
