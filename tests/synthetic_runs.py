@@ -1,6 +1,7 @@
 """Writes run folders with synthetic numbers."""
 
 import json
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ from emberlink.envs import metrics
 from emberlink.trainers.config.compose import resolve, to_values
 
 HORIZON = 40
+Numbers = dict[str, Any]
+SCRIPTED: dict[str, Numbers] = {"random_actions": {}, "random_waypoints": {}}
 
 
 @cache
@@ -28,14 +31,15 @@ def write_run(
     overrides: tuple[str, ...] = (),
     episodes: int = 3,
     fires: int = 4,
-    learned: dict[str, Any] | None = None,
-    scripted: tuple[str, ...] = ("random_actions", "random_waypoints"),
+    learned: Numbers | None = None,
+    scripted: Mapping[str, Numbers] = SCRIPTED,
 ) -> Path:
     """Writes a finished, evaluated run without checkpoints and returns its folder.
 
     Args:
         learned: the learned policy's numbers: measure -> a number, or a list with one number per
             held-out fire. Missing measures are random.
+        scripted: the same for each scripted policy.
     """
     config = {**_values(method, (f"episodes={episodes}", *overrides)), "seed": seed}
     run = folder / (name or f"{method}_{config['setup']}_s{seed}")
@@ -51,15 +55,13 @@ def write_run(
     ]
     (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     everyones = np.random.default_rng(7)
-    given = {
-        m: np.broadcast_to(v, fires).astype(float).tolist() for m, v in (learned or {}).items()
-    }
 
-    def drawn(generator: np.random.Generator) -> dict[str, list[float]]:
-        return {m: (60 * generator.random(fires)).tolist() for m in metrics.NAMES}
+    def drawn(generator: np.random.Generator, given: Numbers) -> dict[str, list[float]]:
+        numbers = {m: (60 * generator.random(fires)).tolist() for m in metrics.NAMES}
+        return numbers | {m: np.full(fires, v, float).tolist() for m, v in given.items()}
 
-    results = {"learned": drawn(generator) | given}
-    results |= {policy: drawn(everyones) for policy in scripted}
+    results = {"learned": drawn(generator, learned or {})}
+    results |= {policy: drawn(everyones, given) for policy, given in scripted.items()}
     write_evaluation(
         run,
         {
@@ -84,3 +86,11 @@ def read_evaluation(run: Path) -> dict[str, Any]:
 def write_evaluation(run: Path, content: Any) -> None:
     """Writes eval.json."""
     (run / "eval.json").write_text(json.dumps(content))
+
+
+def evaluate_otherwise(run: Path, radio: dict[str, float], name: str = "", **coverage: Any) -> None:
+    """Writes an evaluation with another radio and coverage by policy."""
+    content = read_evaluation(run) | {"environment": {"radio": radio}}
+    for policy, value in coverage.items():
+        content["results"]["huygens"][policy]["coverage"] = np.full(4, value, float).tolist()
+    (run / (name or f"eval_{radio}.json")).write_text(json.dumps(content))

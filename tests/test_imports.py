@@ -11,7 +11,6 @@ FOLDERS = ("envs", "comm", "policies", "trainers", "configs")
 
 LOADED = """
 import sys
-from collections import Counter
 before = set(sys.modules)
 import {module}
 heavy = {{"torch", "torchrl", "tensordict", "hydra", "wandb", "matplotlib", "pydantic"}}

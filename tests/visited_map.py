@@ -3,23 +3,17 @@
 from typing import ClassVar
 
 import torch
-from pydantic import ConfigDict
-from pydantic.dataclasses import dataclass
 from torchrl.data import Unbounded
 
 from emberlink.comm.base import CommModule
+from emberlink.comm.no_comm import NoCommConfig
 from emberlink.envs import keys
-
-
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
-class VisitedMapConfig:
-    """No settings."""
 
 
 class VisitedMap(CommModule):
     """Marks the UAV's cell, merges the maps of its neighbours, and observes the size of its map."""
 
-    config_type: ClassVar[type] = VisitedMapConfig
+    config_type: ClassVar[type] = NoCommConfig
     hears: ClassVar[bool] = True
     in_keys: ClassVar = [keys.OBSERVATION, keys.POSITION, keys.HEARS]
     out_keys: ClassVar = [keys.OBSERVATION]

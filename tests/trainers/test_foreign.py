@@ -17,8 +17,6 @@ from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.base import SCRIPTED, Scripted
 from emberlink.trainers.cli.main import main
-from emberlink.trainers.config import schema
-from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.evaluation.export import Decision, export
 from emberlink.trainers.evaluation.foreign import FOREIGN, OnnxPolicy, new_run, open_policy, reopen
 
@@ -124,22 +122,14 @@ def test_a_policy_that_fails_is_one_line_with_its_name(source, name, message):
     assert "\n" not in str(error.value)
 
 
-class Elsewhere:
-    """Finds one policy more than SCRIPTED, of another package."""
-
-    @staticmethod
-    def find(name):
-        return Broken if name == "broken" else SCRIPTED.find(name)
-
-
 class Broken(Scripted):
     def forward(self, tensordict):
         raise ValueError("no fuel")
 
 
 def test_a_scripted_policy_of_another_package_that_fails_leaves_the_others(monkeypatch):
-    for module in (evaluate, schema):
-        monkeypatch.setattr(module, "SCRIPTED", Elsewhere)
+    known, find = type(SCRIPTED), type(SCRIPTED).find
+    monkeypatch.setattr(known, "find", lambda of, x: Broken if x == "broken" else find(of, x))
     names = ["broken", "stationary"]
     more = {"horizon": 20, "evaluation.scripted": names}
     with warnings.catch_warnings(record=True) as caught:
@@ -149,25 +139,10 @@ def test_a_scripted_policy_of_another_package_that_fails_leaves_the_others(monke
 
 
 def test_comparisons_and_replays_read_its_folder(source, capsys):
-    options = [
-        "setup=tuned",
-        "env.horizon=20",
-        "env.num_uavs=3",
-        "evaluation.scripted=[]",
-        "--fires",
-        "2",
-    ]
+    options = "setup=tuned env.horizon=20 env.num_uavs=3 evaluation.scripted=[] --fires 2"
     for seed in (0, 1):
-        words = [
-            "eval",
-            "mine.py:turn",
-            "independent",
-            *options,
-            f"seed={seed}",
-            "--name",
-            "turner",
-        ]
-        assert main(words) == 0
+        words = f"eval mine.py:turn independent {options} seed={seed} --name turner"
+        assert main(words.split()) == 0
     folders = sorted(Path("runs").iterdir())
     table = trainers.compare("runs").ranking
     assert set(table["label"]) == {"turner"}
@@ -241,13 +216,10 @@ def test_an_onnx_file_acts_like_the_run(settings, tmp_path):
     assert card["method"] == "independent"
     assert list(card["inputs"]) == list(onnx.inputs)
     file = str(tmp_path / "policy.onnx")
-    scored = trainers.evaluate(file, "independent", episodes=2, scripted=False)
-    torch.testing.assert_close(
-        torch.tensor(scored["huygens"]["learned"]["coverage"]),
-        torch.tensor(trainers.evaluate(run.path, episodes=2)["huygens"]["learned"]["coverage"]),
-        atol=1.0,
-        rtol=0,
-    )
+    of_file = trainers.evaluate(file, "independent", episodes=2, scripted=False)
+    of_run = trainers.evaluate(run.path, episodes=2)
+    coverage = [of["huygens"]["learned"]["coverage"] for of in (of_file, of_run)]
+    assert coverage[0] == pytest.approx(coverage[1], abs=1.0)
 
 
 TINY = {

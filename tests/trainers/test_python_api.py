@@ -1,7 +1,6 @@
 """Tests the Python API, which equals the commands but does not print or exit."""
 
 import json
-import threading
 
 import hydra
 import pytest
@@ -36,39 +35,12 @@ def _silent(capfd):
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """Calls `train` in a thread; returns the run and its progress."""
-    output, steps, runs = tmp_path_factory.mktemp("runs"), [], []
-
-    def work():
-        runs.append(
-            trainers.train(
-                "consensus",
-                setup="tuned",
-                fire="paper",
-                progress=lambda now: steps.append(now.step),
-                output=str(output),
-                **SHORT,
-            )
-        )
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
+    """Calls `train` and returns its run."""
+    steps, more = [], {"output": str(tmp_path_factory.mktemp("runs")), **SHORT}
+    more["progress"] = lambda now: steps.append(now.step)
+    run = trainers.train("consensus", setup="tuned", fire="paper", **more)
     assert steps == list(range(1, 31))
-    return runs[0]
-
-
-def test_an_exception_in_the_progress_ends_the_training(tmp_path):
-    class Enough(Exception):
-        pass
-
-    def stop(progress):
-        raise Enough
-
-    with pytest.raises(Enough):
-        trainers.train("independent", progress=stop, output=str(tmp_path), **SHORT)
-    (folder,) = tmp_path.iterdir()
-    assert not RunFolder(folder).newest.exists()
+    return run
 
 
 def test_evaluate_is_the_evaluation_of_the_training(trained):

@@ -6,7 +6,7 @@ import signal
 import pytest
 from tiny_run import TINY
 
-from emberlink.trainers import resume, train
+from emberlink.trainers import train
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.terminal.signals import Interrupted, Interruption
@@ -85,6 +85,3 @@ def test_ctrl_c_in_a_function_saves_and_restores_the_handler(tmp_path):
     (folder,) = (tmp_path / "stopped").iterdir()
     assert RunFolder(folder).step() == 7
     assert not (folder / "lock").exists()
-    short |= {"output": str(tmp_path / "whole"), "evaluate_after": False}
-    whole, resumed = train("independent", **short), resume(folder, evaluate_after=False)
-    assert RunFolder(resumed.path).metrics() == RunFolder(whole.path).metrics()

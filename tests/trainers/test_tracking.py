@@ -177,14 +177,13 @@ def test_the_id_and_the_mode_of_the_caller_are_respected(monkeypatch):
     monkeypatch.setenv("WANDB_RUN_ID", "run-of-mine")
     monkeypatch.setenv("WANDB_NAME", "mine")
     monkeypatch.setenv("WANDB_MODE", "offline")
-    short = {k: v for k, v in SHORT.items() if k not in ("setup", "fire")}
-    run = trainers.train("independent", setup="tuned", fire="paper", logger="wandb", **short)
-    names = {r.run.display_name for r in written(RunFolder(run.path)) if r.HasField("run")}
+    run = command("wandb")
+    names = {r.run.display_name for r in written(run) if r.HasField("run")}
     assert names == {"mine"}
     monkeypatch.delenv("WANDB_RUN_ID")
-    trainers.resume(run, episodes=5)  # the id is that of the first part
+    trainers.resume(run.path, episodes=5)  # the id is that of the first part
     assert {file.name for file in run.path.rglob("*.wandb")} == {"run-run-of-mine.wandb"}
-    assert [row["_step"] for row in rows_of(RunFolder(run.path))] == [1, 2, 3, 4, 5]
+    assert [row["_step"] for row in rows_of(run)] == [1, 2, 3, 4, 5]
     monkeypatch.setenv("WANDB_MODE", "disabled")
     Path("runs").rename("before")
     assert not [*command("wandb").path.rglob("*.wandb")]

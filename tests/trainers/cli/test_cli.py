@@ -10,6 +10,7 @@ from emberlink.trainers.cli import commands, main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs import checkpoint
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.terminal.console import SafeConsole
 
 POLICIES = resolve("consensus").evaluation.scripted
 
@@ -72,3 +73,8 @@ def test_a_warning_is_one_line_and_printed_once(monkeypatch):
     monkeypatch.setattr(commands, "_sweep", warn)
     assert main.main(["sweep", "consensus"]) == 0
     assert said == ["emberlink: warning: two lines\n", ""]
+
+
+def test_escape_sequences_of_names_are_not_printed(capsys):
+    SafeConsole().print("run\x1b[31m\x1b]0;title\x9b1m\u202egnp.exe", style="bold")
+    assert capsys.readouterr().out == "run?[31m?]0;title?1m?gnp.exe\n"

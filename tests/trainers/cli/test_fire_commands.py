@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+import refusal
 from burning import burning_cells
 from fire_files import write_asc
 from PIL import Image
@@ -38,13 +39,7 @@ def ran(capsys, *arguments) -> list[str]:
 
 def refused(capsys, *arguments) -> str:
     """Runs a command that ends at status 2 and returns its message."""
-    capsys.readouterr()
-    assert main.main(["fire", *map(str, arguments)]) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith(f"emberlink fire {arguments[0]}: ")
-    assert err.count("\n") == 1, err
-    return err
+    return refusal.refused(["fire", *arguments], capsys, f"emberlink fire {arguments[0]}: ")
 
 
 def numbers(lines: list[str]) -> dict[str, float]:

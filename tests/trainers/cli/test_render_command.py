@@ -126,7 +126,6 @@ def test_errors_of_render(tmp_path, capsys):
     there.write_text("mine")
     cases = [
         ([tmp_path / "none"], ["no such run folder"]),
-        ([run, "world=moon"], ["world 'moon'", "known: blackout, "]),
         ([run, "--fire", "zzz"], ["fire 'zzz'", "known: "]),
         ([run, "--fire", "paper:x"], ["'x'", "0 to 65535"]),
         ([run, "--policy", "zzz"], ["policy='zzz'", "random_waypoints"]),

@@ -1,9 +1,7 @@
 """Tests the value of communication on numbers that were computed by hand."""
 
-import json
-
 import pytest
-from synthetic_runs import read_evaluation, write_run
+from synthetic_runs import evaluate_otherwise, write_run
 
 from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.trainers.comparison.comparison import compare_runs
@@ -14,12 +12,9 @@ from emberlink.trainers.evaluation.evaluate import evaluation_fires, play_blocks
 OFF, FULL = "env.radio.range=0", "env.radio.range=inf"
 
 
-def evaluate_otherwise(run, reach: float, coverage: list[float]) -> None:
-    """Writes an evaluation of a run's networks with another range."""
-    content = read_evaluation(run)
-    content["environment"] = {"radio": {"range": reach, "loss": 0.0}}
-    content["results"]["huygens"]["learned"]["coverage"] = coverage
-    (run / f"eval_env.radio.range={reach}.json").write_text(json.dumps(content))
+def at_range(run, reach: float, **coverage) -> None:
+    """Writes an evaluation of a run with another range; `coverage` is by policy."""
+    evaluate_otherwise(run, {"range": reach, "loss": 0.0}, **coverage)
 
 
 def values(*paths):
@@ -34,8 +29,8 @@ def interval(row, name):
 def test_networks_evaluated_with_other_radios(tmp_path):
     for seed, more in ((0, 0.0), (1, 2.0)):
         run = write_run(tmp_path, seed=seed, learned={"coverage": [50.0 + more, 60, 70, 80]})
-        evaluate_otherwise(run, 0.0, [40.0 + more, 50, 60, 70])
-        evaluate_otherwise(run, float("inf"), [60.0 + more, 80, 90, 90])
+        at_range(run, 0.0, learned=[40.0 + more, 50, 60, 70])
+        at_range(run, float("inf"), learned=[60.0 + more, 80, 90, 90])
     (row,) = values(tmp_path)
     assert (row["label"], row["measure"], row["radios"]) == ("consensus", "coverage", "evaluated")
     assert (row["none"], row["with_radio"], row["full"]) == (55.25, 65.25, 80.25)
@@ -71,16 +66,16 @@ def test_networks_trained_with_other_radios(tmp_path):
 def test_a_resample_without_anything_to_gain_leaves_no_interval(tmp_path):
     """On the first of four fires there is none; one resample in 256 draws only this fire."""
     run = write_run(tmp_path, learned={"coverage": [55.0, 60.0, 60.0, 60.0]})
-    evaluate_otherwise(run, 0.0, [50.0] * 4)
-    evaluate_otherwise(run, float("inf"), [50.0, 70.0, 70.0, 70.0])
+    at_range(run, 0.0, learned=[50.0] * 4)
+    at_range(run, float("inf"), learned=[50.0, 70.0, 70.0, 70.0])
     (row,) = values(tmp_path)
     assert (row["value"], interval(row, "value")) == (35 / 60, (None, None))
 
 
 def test_a_value_is_undetermined_where_no_limits_may_gain_nothing(tmp_path):
     run = write_run(tmp_path, learned={"coverage": [60.0, 60, 60, 60]})
-    evaluate_otherwise(run, 0.0, [50.0, 50, 50, 50])
-    evaluate_otherwise(run, float("inf"), [40.0, 80, 80, 45])
+    at_range(run, 0.0, learned=[50.0, 50, 50, 50])
+    at_range(run, float("inf"), learned=[40.0, 80, 80, 45])
     (row,) = values(tmp_path)
     assert (row["full"], row["value"], interval(row, "value")) == (61.25, None, (None, None))
     (table,) = (t for t in tables(compare_runs([tmp_path]), row["section"]) if "gain" in t.title)
@@ -88,43 +83,32 @@ def test_a_value_is_undetermined_where_no_limits_may_gain_nothing(tmp_path):
 
 
 def test_scripted_policies_have_a_value_for_each_radio(tmp_path):
-    names = ("map_greedy_alone", "map_greedy", "map_greedy_all")
     more = "env.radio.bandwidth=8"  # which scripted policies ignore
     for reach, middle, other in ((20, 58.0, ()), (5, 52.0, ()), (5, 52.0, (more,))):
         overrides = (f"env.radio.range={reach}", *other)
-        name = f"r{reach}{len(other)}"
-        run = write_run(tmp_path, name=name, scripted=names, overrides=overrides)
-        content = read_evaluation(run)
-        for name, coverage in zip(names, (50.0, middle, 60.0), strict=True):
-            content["results"]["huygens"][name]["coverage"] = [coverage] * 4
-        (run / "eval.json").write_text(json.dumps(content))
+        write_run(
+            tmp_path,
+            name=f"r{reach}{len(other)}",
+            scripted=covering(map_greedy_alone=50.0, map_greedy=middle, map_greedy_all=60.0),
+            overrides=overrides,
+        )
     found = {row["label"]: row["value"] for row in values(tmp_path)}
     assert found == {"map greedy, range 20": 0.8, "map greedy, range 5": 0.2}
 
 
-def scripted_run(folder, base, results: dict[str, dict[str, float]]):
-    """Writes a run with evaluations of scripted policies: file name -> policy -> coverage."""
-    names = list(dict.fromkeys(name for played in results.values() for name in played))
-    overrides = () if base is None else (f"env.base={base}",)
-    run = write_run(folder, scripted=names, overrides=("env.radio.range=10", *overrides))
-    content = read_evaluation(run)
-    for name, played in results.items():
-        for policy, coverage in played.items():
-            content["results"]["huygens"][policy]["coverage"] = [coverage] * 4
-        if name != "eval.json":
-            reach = float(name.removeprefix("eval_env.radio.range=").removesuffix(".json"))
-            content["environment"] = {"radio": {"range": reach, "loss": 0.0}}
-        (run / name).write_text(json.dumps(content))
+def covering(**coverage: float):
+    return {policy: {"coverage": value} for policy, value in coverage.items()}
 
 
 def test_with_a_base_scripted_policies_need_the_other_radios(tmp_path):
     """Without messages to each other, UAVs of map_greedy_alone still report to the base."""
     own = {"map_greedy_alone": 70.0, "map_greedy": 80.0, "map_greedy_all": 90.0, "courier": 85.0}
-    scripted_run(tmp_path / "one", [0, 0], {"eval.json": own})
+    based = ("env.radio.range=10", "env.base=[0,0]")
+    write_run(tmp_path / "one", scripted=covering(**own), overrides=based)
     assert not values(tmp_path / "one")
-    off, full = ({**own, "map_greedy": a, "courier": b} for a, b in ((40.0, 45.0), (90.0, 95.0)))
-    results = {"eval.json": own, f"eval_{OFF}.json": off, f"eval_{FULL}.json": full}
-    scripted_run(tmp_path / "three", [0, 0], results)
+    run = write_run(tmp_path / "three", scripted=covering(**own), overrides=based)
+    for reach, greedy, courier in ((0.0, 40.0, 45.0), (float("inf"), 90.0, 95.0)):
+        at_range(run, reach, map_greedy=greedy, courier=courier)
     compared = compare_runs([tmp_path / "three"])
     found = compared.communication[compared.communication["radios"] == "scripted"]
     columns = ["label", "none", "with_radio", "full", "value"]

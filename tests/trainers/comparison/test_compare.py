@@ -2,15 +2,15 @@
 
 import html.parser
 import json
+import math
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from refusal import refused
-from synthetic_runs import read_evaluation, write_evaluation, write_run
+from synthetic_runs import evaluate_otherwise, read_evaluation, write_evaluation, write_run
 
 from emberlink.envs import metrics
 from emberlink.envs.utils.errors import UserError
@@ -19,7 +19,7 @@ from emberlink.trainers.comparison import claims
 from emberlink.trainers.comparison.bootstrap import crossed_interval, crossed_p, iqm_difference
 from emberlink.trainers.comparison.comparison import compare_runs
 
-LOST = "consensus, evaluated with env.radio.loss=0.5"
+LOSS, LOST = {"loss": 0.5}, "consensus, evaluated with env.radio.loss=0.5"
 
 
 def only(comparison, measure="coverage"):
@@ -40,30 +40,14 @@ def change(run, **values):
     write_evaluation(run, read_evaluation(run) | values)
 
 
-def change_policy(run, policy, measure, value):
-    content = read_evaluation(run)
-    content["results"]["huygens"][policy][measure] = [value] * 4
-    write_evaluation(run, content)
-
-
-def evaluate_otherwise(run: Path, name="eval_lost.json", **learned: float):
-    """Writes an evaluation with lost messages."""
-    content: dict[str, Any] = read_evaluation(run)
-    content |= {"environment": {"radio": {"loss": 0.5}}}
-    for measure, value in learned.items():
-        content["results"]["huygens"]["learned"][measure] = [value] * 4
-    (run / name).write_text(json.dumps(content))
-
-
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """Writes three seeds of consensus, also with lost messages, two of independent and one."""
     folder = tmp_path_factory.mktemp("runs")
     for seed, coverage in enumerate((50, 70, 60)):
         learned = {"coverage": [coverage - 5, coverage + 5] * 2}
-        evaluate_otherwise(
-            write_run(folder, "consensus", seed, learned=learned), coverage=30 + seed
-        )
+        run = write_run(folder, "consensus", seed, learned=learned)
+        evaluate_otherwise(run, LOSS, learned=30 + seed)
     for seed, coverage in enumerate((40, 65)):
         write_run(folder, "independent", seed, learned={"coverage": coverage})
     write_run(folder, "positional", learned={"coverage": 20})
@@ -215,9 +199,8 @@ def test_other_evaluations_are_not_counted_as_runs(comparison, runs, tmp_path):
     assert set(comparison.claims["label"]) == {"consensus"}
     assert LOST not in set(comparison.curves["label"])
     run = write_run(tmp_path)
-    evaluate_otherwise(run)
-    evaluate_otherwise(run, "eval_twice.json")
-    evaluate_otherwise(run, "eval_step_7.json")
+    for name in ("eval_lost.json", "eval_twice.json", "eval_step_7.json"):
+        evaluate_otherwise(run, LOSS, name)
     content = json.loads((run / "eval_step_7.json").read_text())
     (run / "eval_step_7.json").write_text(json.dumps(content | {"checkpoint": "step_7"}))
     content = read_evaluation(run) | {"message_fault": "zero"}
@@ -236,10 +219,9 @@ def test_other_evaluations_are_not_counted_as_runs(comparison, runs, tmp_path):
 
 def test_scripted_policies_have_rows_of_their_own(tmp_path):
     for seed in range(2):
-        for method, run in ((m, write_run(tmp_path, m, seed)) for m in ("consensus", "positional")):
-            change_policy(run, "random_actions", "coverage", 5.0)
-            if method == "positional":
-                change_policy(run, "random_actions", "mean_reward", 7.0)
+        for method, more in (("consensus", {}), ("positional", {"mean_reward": 7.0})):
+            scripted = {"random_actions": {"coverage": 5.0, **more}}
+            write_run(tmp_path, method, seed, scripted=scripted)
     ranking = compare_runs([tmp_path]).ranking
     rows = ranking[ranking["policy"] == "random_actions"].set_index(["measure", "label"])["iqm"]
     assert rows["coverage"].to_dict() == {"random actions": 5.0}
@@ -252,8 +234,8 @@ def test_different_rewards_are_not_ranked(tmp_path):
         write_run(tmp_path / "settings", "consensus", seed)
         write_run(tmp_path / "settings", "independent", seed)
         write_run(tmp_path / "earned", "independent", seed)
-        run = write_run(tmp_path / "earned", "positional", seed)
-        change_policy(run, "random_actions", "mean_reward", 7.0)
+        scripted = {"random_actions": {"mean_reward": 7.0}}
+        write_run(tmp_path / "earned", "positional", seed, scripted=scripted)
     for name, because in (("settings", "env.reward.new_fire"), ("earned", "random_actions acts")):
         comparison = compare_runs([tmp_path / name])
         rows = only(comparison, "mean_reward")
@@ -408,7 +390,7 @@ SPOILT = {
         lambda run: change(run, held_out={"huygens": {"fire_seeds": [9]}}),
         "not evaluated on the fires",
     ),
-    "nan": (lambda run: change_policy(run, "learned", "coverage", float("nan")), "finite"),
+    "nan": (lambda run: evaluate_otherwise(run, LOSS, "eval.json", learned=math.nan), "finite"),
     "not evaluated": (lambda run: (run / "eval.json").unlink(), "emberlink eval"),
     "unfinished": (lambda run: (run / "metrics.jsonl").write_text(""), "unfinished: 0 of 3"),
     "metrics": (lambda run: (run / "metrics.jsonl").write_text("{\n" * 3), "metrics.jsonl"),

@@ -20,7 +20,7 @@ from robustness import SOAK
 from emberlink.comm.base import MODULES
 from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.compose import from_values, resolve, to_values
+from emberlink.trainers.config.compose import flat, from_values, resolve, to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.ddpg import DDPGConfig
 from emberlink.trainers.training.setup import TrainingSetup
@@ -258,17 +258,8 @@ def test_an_invalid_value_gives_one_line_that_names_the_key(chosen, key, schema)
         refused(key, lambda: from_values(without))
 
 
-@pytest.mark.parametrize(
-    ("given", "plain"),
-    [
-        ({"learner.hidden": np.arange(1, 4)}, [1, 2, 3]),
-        ({"learner.gamma": np.float64(0.5)}, 0.5),
-        ({"output": Path("my/runs")}, "my/runs"),
-    ],
-)
-def test_numpys_numbers_are_numbers_and_paths_are_text(given, plain):
-    ((key, _),) = given.items()
-    values = to_values(resolve("consensus", **given))
-    for part in key.split("."):
-        values = values[part]
-    assert values == plain
+def test_numpys_numbers_are_numbers_and_paths_are_text():
+    given = {"learner.hidden": np.arange(1, 4), "learner.gamma": np.float64(0.5)}
+    values = flat(to_values(resolve("consensus", output=Path("my/runs"), **given)))
+    found = values["learner.hidden"], values["learner.gamma"], values["output"]
+    assert found == ([1, 2, 3], 0.5, "my/runs")
