@@ -18,8 +18,6 @@ def test_what_the_base_knows_is_averaged_over_steps():
     ("seen", "burning", "time"),
     [
         ([0, 3, 4, 4], [4, 4, 4, 4], 3),
-        ([4, 4, 4, 4], [4, 4, 4, 4], 1),
-        ([0, 1, 2, 4], [4, 4, 4, 4], 4),
         ([0, 1, 2, 3], [4, 4, 4, 4], 4),  # never: the horizon
         ([0, 4, 4, 4], [4, 4, 5, 6], 2),  # the fire has grown since
         ([3, 4, 5, 6], [4, 5, 6, 7], 4),  # always one step behind

@@ -1,5 +1,7 @@
 """Tests that with `env.knowledge: own` nothing reaches a UAV that is out of range."""
 
+import itertools
+
 import pytest
 import torch
 
@@ -10,13 +12,8 @@ from emberlink.trainers import make_env
 @pytest.mark.parametrize(
     ("method", "observation"),
     [
-        ("independent", "vector"),
-        ("independent", "window"),
-        ("positional", "vector"),
-        ("positional", "window"),
-        ("consensus", "vector"),
-        ("consensus", "window"),
-        *((method, "map") for method in ("independent", "positional", "consensus", "maps")),
+        *itertools.product(("independent", "positional", "consensus"), ("vector", "window", "map")),
+        ("maps", "map"),
     ],
 )
 def test_nothing_that_a_uav_does_reaches_one_out_of_range(method, observation):

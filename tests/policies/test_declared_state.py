@@ -56,6 +56,16 @@ def alone(policy):
     return torch.stack([run[keys.ACTION][0] for run in runs])
 
 
+def flown(env, act):
+    """Returns the actions of an episode in which a function acts on each time step."""
+    td, actions = env.reset(), []
+    for _ in range(HORIZON):
+        td = act(td)
+        actions.append(td[keys.ACTION].clone())
+        td = step_mdp(env.step(td))
+    return torch.stack(actions, 1)[0]
+
+
 @pytest.fixture(params=CONFIGS)
 def policy(request):
     return policy_of(request.param)
@@ -71,14 +81,10 @@ def test_state_is_declared(policy):
 
 
 def test_only_declared_keys_are_read(policy):
-    env, actions = make(policy.config, 3), []
-    td = env.reset()
-    for _ in range(HORIZON):
-        acted = policy(td.select(*policy.in_keys))
-        td.update(acted.select(*policy.out_keys))
-        actions.append(td[keys.ACTION].clone())
-        td = step_mdp(env.step(td))
-    assert torch.stack(actions, 1)[0].equal(alone(policy)[0, :HORIZON])
+    def act(td):
+        return td.update(policy(td.select(*policy.in_keys)).select(*policy.out_keys))
+
+    assert flown(make(policy.config, 3), act).equal(alone(policy)[0, :HORIZON])
 
 
 # A ParallelEnv starts processes, which import torch for seconds.
@@ -115,14 +121,15 @@ def inputs(policy, td):
 def test_exported_policy_acts_as_the_policy(policy):
     start = make(policy.config, 3).reset()
     program = torch.export.export(policy, args=(), kwargs=inputs(policy, start), strict=False)
-    exported, env, actions = program.module(), make(policy.config, 3), []
-    td = env.reset()
-    for _ in range(HORIZON):
+    exported = program.module()
+
+    def act(td):
         for key, value in zip(policy.out_keys, exported(**inputs(policy, td)), strict=True):
             td[key] = value.clone()
-        actions.append(td[keys.ACTION].clone())
-        td = step_mdp(env.step(td))
-    assert torch.allclose(torch.stack(actions, 1)[0], alone(policy)[0, :HORIZON], atol=1e-5)
+        return td
+
+    actions = flown(make(policy.config, 3), act)
+    assert torch.allclose(actions, alone(policy)[0, :HORIZON], atol=1e-5)
 
 
 @pytest.mark.slow  # torch.compile is imported for seconds
@@ -152,11 +159,6 @@ def test_policy_without_its_state_says_so_after_the_first_step(policy):
 
 
 def test_own_loop_without_primer_keeps_the_state(policy):
-    config, actions = policy.config, []
+    config = policy.config
     env = build_env(config, num_envs=1, fire=config.fire, seed=3, device="cpu")
-    td = env.reset()
-    for _ in range(HORIZON):
-        td = env.step(policy(td))
-        actions.append(td[keys.ACTION])
-        td = step_mdp(td)
-    assert torch.stack(actions, 1)[0].equal(alone(policy)[0, :HORIZON])
+    assert flown(env, policy).equal(alone(policy)[0, :HORIZON])

@@ -24,26 +24,23 @@ class Still(torch.nn.Module):
         return torch.zeros_like(observation[..., :3])
 
 
-def explorer(*, theta: float, sigma: float, dt: float, envs: int = ENVS, network=None):
+def explorer(*, theta: float, sigma: float, dt: float, envs: int = ENVS):
     observation = Composite({keys.OBSERVATION: Unbounded((envs, UAVS, 6))}, shape=(envs,))
     action = Composite({keys.ACTION: Bounded(-1.0, 1.0, (envs, UAVS, 3))}, shape=(envs,))
     actor = make_actor(observation, action, (8, 8))
-    actor.module = network or Still()
+    actor.module = Still()
     noise = OrnsteinUhlenbeck(
         ExplorationConfig(theta=theta, sigma=sigma, dt=dt), UAVS, torch.Generator().manual_seed(0)
     )
     return TensorDictSequential(actor, noise)
 
 
-def play(policy, starts: list[torch.Tensor | bool], envs: int = ENVS) -> torch.Tensor:
-    """Returns actions of consecutive steps, [steps, envs, uavs, 3]; `starts` marks new episodes."""
+def play(policy, steps: int, envs: int = ENVS) -> torch.Tensor:
+    """Returns the actions of the first steps of an episode, [steps, envs, uavs, 3]."""
     actions = []
     td = TensorDict({keys.OBSERVATION: torch.ones(envs, UAVS, 6)}, batch_size=[envs])
-    step = torch.zeros(envs, dtype=torch.int64)
-    for start in starts:
-        fresh = torch.as_tensor(start).flatten().expand(envs)
-        step = torch.where(fresh, 0, step + 1)
-        td[keys.STEP] = step
+    for step in range(steps):
+        td[keys.STEP] = torch.full((envs,), step)
         td = policy(td)
         actions.append(td[keys.ACTION].clone())
         td[NOISE] = td["next", *NOISE]
@@ -52,7 +49,7 @@ def play(policy, starts: list[torch.Tensor | bool], envs: int = ENVS) -> torch.T
 
 def test_the_noise_is_an_ornstein_uhlenbeck_process():
     theta, sigma, dt = 0.8, 0.2, 0.25
-    x = play(explorer(theta=theta, sigma=sigma, dt=dt), [True, *[False] * 11])
+    x = play(explorer(theta=theta, sigma=sigma, dt=dt), 12)
     assert x.abs().max() < 1  # without clipping, so that the action equals the noise
     before, after = x[3:-1].flatten(), x[4:].flatten()
     slope = (before * (after - before)).mean() / before.square().mean()
@@ -66,7 +63,7 @@ def test_the_noise_is_an_ornstein_uhlenbeck_process():
 
 
 def test_actions_stay_in_bounds():
-    x = play(explorer(theta=0.1, sigma=5.0, dt=1.0, envs=50), [True, *[False] * 20], envs=50)
+    x = play(explorer(theta=0.1, sigma=5.0, dt=1.0, envs=50), 21, envs=50)
     assert x.abs().max() == 1
     assert (x.abs() == 1).float().mean() > 0.5
 

@@ -34,17 +34,8 @@ def settings_of(**changes: Any) -> dict[str, Any]:
     return {**dataclasses.asdict(load_scenario("huygens")), **changes}
 
 
-@pytest.fixture(scope="module")
-def paper() -> torch.Tensor:
-    return make_fires(load_scenario("paper"), fire_seeds("train", 1), GRID, HORIZON)
-
-
-@pytest.fixture(scope="module")
-def test_fires() -> torch.Tensor:
-    return make_fires(load_scenario("huygens"), fire_seeds("test", 100), GRID, HORIZON)
-
-
-def test_paper_is_the_measured_fire(paper: torch.Tensor):
+def test_paper_is_the_measured_fire():
+    paper = make_fires(load_scenario("paper"), fire_seeds("train", 1), GRID, HORIZON)
     count = burning_cells(paper, HORIZON)[0]
     assert (int(count[0]), int(count[-1])) == (77, 141)
     assert (count.diff() >= 0).all()
@@ -60,7 +51,8 @@ def test_paper_is_the_measured_fire(paper: torch.Tensor):
     assert [g.tolist() for g in grown] == [[4, 1], [0, 1]]  # towards +x and not upwind
 
 
-def test_huygens_counts(test_fires: torch.Tensor):
+def test_huygens_counts():
+    test_fires = make_fires(load_scenario("huygens"), fire_seeds("test", 100), GRID, HORIZON)
     count = burning_cells(test_fires, HORIZON)
     start, end = count[:, 0], count[:, -1]
     good = (start >= 60) & (start <= 120) & (end >= 110) & (end <= 190)

@@ -22,11 +22,6 @@ CONFIG = load_scenario("reaction")
 assert isinstance(CONFIG, ReactionConfig)
 
 
-@pytest.fixture(scope="module")
-def fires() -> torch.Tensor:
-    return reaction_fires(CONFIG, fire_seeds("test", 12), GRID, HORIZON)
-
-
 def test_step_zero_is_a_ring_by_hand():
     config = dataclasses.replace(
         CONFIG,
@@ -45,7 +40,8 @@ def test_step_zero_is_a_ring_by_hand():
     assert gone[away < 2.7 * scale].isinf().all()
 
 
-def test_times(fires: torch.Tensor):
+def test_times():
+    fires = reaction_fires(CONFIG, fire_seeds("test", 12), GRID, HORIZON)
     arrival, gone = fires.unbind(1)
     assert fires.dtype == torch.float32
     assert fires.shape == (12, 2, *GRID)

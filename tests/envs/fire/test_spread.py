@@ -119,11 +119,8 @@ def test_symmetry_with_fuel_and_barriers():
 
 
 def test_arrival_never_decreases_outwards():
-    """Checks rays, and with patchy fuel that every cell has an earlier neighbour."""
-    even, field = grow(), torch.rand(1, 24, 24, generator=torch.Generator().manual_seed(3))
-    for dx, dy in ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)):
-        ray = torch.stack([even[11 + k * dx, 11 + k * dy] for k in range(11)])
-        assert (ray[1:] >= ray[:-1]).all()
+    """With patchy fuel, every cell has an earlier neighbour."""
+    field = torch.rand(1, 24, 24, generator=torch.Generator().manual_seed(3))
     patchy = grow(rate_field=field, head=0.024)
     around = (
         torch.nn.functional.pad(patchy, (1, 1, 1, 1), value=math.inf)
