@@ -68,13 +68,6 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def metadata(wheel: Path):
-    with zipfile.ZipFile(wheel) as file:
-        (name,) = (n for n in file.namelist() if n.endswith(".dist-info/METADATA"))
-        return HeaderParser().parsestr(file.read(name).decode())
-
-
-@pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Returns the executables of an environment with the wheel and the installed libraries."""
     folder = tmp_path_factory.mktemp("installed")
@@ -88,15 +81,6 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     # --ignore-installed: do not replace the emberlink that is visible through the path file.
     run(*pip, "--no-deps", "--no-index", "--ignore-installed", wheel, cwd=folder)
     return programs
-
-
-@pytest.fixture
-def elsewhere(tmp_path: Path) -> tuple[Path, dict[str, str]]:
-    """Returns a working folder and environment variables that do not refer to the checkout."""
-    env = {
-        k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "PYTEST", "EMBERLINK"))
-    }
-    return tmp_path, env | {"OMP_NUM_THREADS": "1", "XDG_CACHE_HOME": str(tmp_path / "cache")}
 
 
 def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
@@ -123,7 +107,10 @@ def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
     assert "comm/__init__.py" not in held
 
 
-def test_every_dependency_is_pinned(metadata):
+def test_every_dependency_is_pinned(wheel: Path):
+    with zipfile.ZipFile(wheel) as file:
+        (name,) = (n for n in file.namelist() if n.endswith(".dist-info/METADATA"))
+        metadata = HeaderParser().parsestr(file.read(name).decode())
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = [line for line in lines if line and not line.startswith("#")]
     # No local version such as +cpu, no URL.
@@ -141,10 +128,12 @@ def _normal(name: str) -> str:
 
 
 @pytest.mark.heavy
-def test_an_extension_package_adds_a_method_a_setup_and_a_fire(installed: Path, elsewhere):
+def test_an_extension_package_adds_a_method_a_setup_and_a_fire(installed: Path, tmp_path: Path):
     """Also tests that the console script of the wheel trains."""
-    cwd, env = elsewhere
-    python = installed / "python"
+    ours = ("PYTHON", "PYTEST", "EMBERLINK")  # variables that may refer to the checkout
+    env = {name: value for name, value in os.environ.items() if not name.startswith(ours)}
+    env |= {"OMP_NUM_THREADS": "1", "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    cwd, python = tmp_path, installed / "python"
     before = {file: file.stat().st_mtime_ns for file in installed.parent.rglob("emberlink/**/*.py")}
     pip = (sys.executable, "-m", "pip", "--python", python, "install", "-q", "--no-deps")
     source = write_package(cwd / "source")

@@ -10,7 +10,6 @@ from emberlink.comm.consensus import (
     ConsensusConfig,
     HeadingConfig,
     circling,
-    heading_reward,
 )
 from emberlink.envs import keys
 from emberlink.envs.config import RadioConfig, RewardConfig, WildfireConfig
@@ -34,14 +33,6 @@ def test_the_heading_term_is_added_unless_the_uav_left_the_box(axes, exits):
     after.set(keys.REWARD, torch.full((1, 4, 1), -7.0))
     reward = talk._step(before, after)[keys.REWARD]
     assert reward.flatten().tolist() == [value - 7 for value in exits]
-
-
-def test_approach_is_the_decrease_of_the_distance():
-    config = HeadingConfig(form="approach", weight=2.0)
-    before = torch.tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 1], [3, 0, 1]])
-    after = torch.tensor([[3.0, 0, 1], [0, 0, 2], [0, 0, 1], [0, 0, 1]])
-    target = torch.tensor([[3.0, 4, 1], [0, 0, 4], [3, 4, 1], [3, 4, 1]])
-    assert heading_reward(before, after, target, config).tolist() == [2, 2, 0, -2]
 
 
 @pytest.mark.parametrize(

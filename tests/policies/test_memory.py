@@ -31,20 +31,6 @@ def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.mark.parametrize("kind", ["none", "gru"])
-@pytest.mark.parametrize("shared", [False, True])
-def test_decision_by_decision_equals_the_whole_episode(kind, shared):
-    actor = network(kind, shared=shared, index=True)
-    envs, decisions = 2, 7
-    observed = drawn(envs, decisions, UAVS, FEATURES)
-    whole, std = actor(actor.empty_state(envs), observed)
-    state = None
-    for k in range(decisions):
-        mean, state = actor.step([observed[:, k]], state)
-        torch.testing.assert_close(mean, whole[:, k], rtol=1e-5, atol=1e-6)
-    assert std.equal(actor.std(torch.Size((envs, UAVS)))[:, None].expand_as(whole))
-
-
 @pytest.mark.parametrize("groups", [1, 2])
 def test_the_gru_is_that_of_torch(groups):
     config = PolicyConfig(memory="gru", units=4)

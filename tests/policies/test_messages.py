@@ -126,14 +126,18 @@ def test_means_and_gradients_equal_those_of_a_scalar_twin(scheme, memory, shared
             assert gradients[0].abs().sum((1, 2)).count_nonzero() >= 2
 
 
-@pytest.mark.parametrize(("scheme", "memory", "shared"), CASES)
+@pytest.mark.parametrize("scheme", ["none", *SCHEMES])
+@pytest.mark.parametrize("memory", ["none", "gru"])
+@pytest.mark.parametrize("shared", [True, False])
 def test_decision_by_decision_equals_the_sequence(scheme, memory, shared):
-    net, observed, hears = network(scheme, memory, shared), drawn(ENVS, 6, UAVS, FEATURES), links(6)
-    whole, _ = net(net.empty_state(ENVS), observed, hears)
+    net = network(scheme, memory, shared)
+    given = [drawn(ENVS, 6, UAVS, FEATURES), links(6)][: 1 + (scheme != "none")]
+    whole, std = net(net.empty_state(ENVS), *given)
     state = None
     for k in range(6):
-        mean, state = net.step([observed[:, k], hears[:, k]], state)
+        mean, state = net.step([each[:, k] for each in given], state)
         torch.testing.assert_close(mean, whole[:, k])
+    assert std.equal(net.std(torch.Size((ENVS, UAVS)))[:, None].expand_as(whole))
 
 
 def test_a_network_flies_teams_of_any_size():
