@@ -22,33 +22,6 @@ def draw(grid, known, seen, step, centre, others, base, **more) -> torch.Tensor:
     return crops.draw(*given, (points, heard, station))[0]
 
 
-def check(grid, seed, step, centre, *, pixels, scales, spread, base):
-    generator = torch.Generator().manual_seed(seed)
-    when = torch.randint(-step // 2 - 1, step + 1, grid, generator=generator)
-    what = torch.randint(0, 3, grid, generator=generator)
-    known = torch.where(when < 0, -1, 4 * when + what).to(torch.int16)
-    seen = torch.rand(grid, generator=generator) < 0.3
-    others = [((3, 2), step), ((grid[0] - 1, grid[1] - 1), 0), ((3, 2), -1), ((0, 5), step // 2)]
-    drawn = draw(
-        *(grid, known, seen, step, centre, others, base),
-        pixels=pixels,
-        scales=scales,
-        spread=spread,
-    )
-    looks = {
-        (x, y): (int(when[x, y]), NAMES[what[x, y]])
-        for x in range(grid[0])
-        for y in range(grid[1])
-        if when[x, y] >= 0
-    }
-    fires = {(int(x), int(y)) for x, y in seen.nonzero()}
-    heard = [(cell, at) for cell, at in others if at >= 0]
-    for index, scale in enumerate(scales):
-        form = {"pixels": pixels, "scale": scale, "spread": spread}
-        expected = picture(looks, fires, grid, centre, heard, base, step, **form)
-        assert drawn[index].tolist() == expected, scale
-
-
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(
     grid=st.tuples(st.integers(8, 20), st.integers(8, 20)),
@@ -60,8 +33,26 @@ def check(grid, seed, step, centre, *, pixels, scales, spread, base):
 )
 def test_pictures_of_any_size(grid, step, place, pixels, scale, spread):
     centre = tuple(round(at * (side - 1)) for at, side in zip(place, grid, strict=True))
-    more = {"scales": (scale, 3), "spread": spread, "base": (0, 6)}
-    check(grid, step, step, centre, pixels=pixels, **more)
+    scales, base = (scale, 3), (0, 6)
+    generator = torch.Generator().manual_seed(step)
+    when = torch.randint(-step // 2 - 1, step + 1, grid, generator=generator)
+    what = torch.randint(0, 3, grid, generator=generator)
+    known = torch.where(when < 0, -1, 4 * when + what).to(torch.int16)
+    seen = torch.rand(grid, generator=generator) < 0.3
+    others = [((3, 2), step), ((grid[0] - 1, grid[1] - 1), 0), ((3, 2), -1), ((0, 5), step // 2)]
+    more = {"pixels": pixels, "spread": spread}
+    drawn = draw(grid, known, seen, step, centre, others, base, scales=scales, **more)
+    looks = {
+        (x, y): (int(when[x, y]), NAMES[what[x, y]])
+        for x in range(grid[0])
+        for y in range(grid[1])
+        if when[x, y] >= 0
+    }
+    fires = {(int(x), int(y)) for x, y in seen.nonzero()}
+    heard = [(cell, at) for cell, at in others if at >= 0]
+    for index, scale in enumerate(scales):
+        expected = picture(looks, fires, grid, centre, heard, base, step, scale=scale, **more)
+        assert drawn[index].tolist() == expected, scale
 
 
 def test_the_largest_sums_fit_into_their_bits():

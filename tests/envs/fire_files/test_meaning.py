@@ -156,8 +156,6 @@ def test_fill_values_are_asked_about_together_and_a_large_ignition_is_not(tmp_pa
     times = raster_of(FIRE, 300.0)
     lit = write_tif(tmp_path / "lit.tif", np.where(times < 0, times, np.maximum(times - 150, 0)))
     assert "from 0 minutes to 149" in read(lit, units="minutes")[1]
-    days = write_tif(tmp_path / "days.tif", np.where(times < 0, -9999, 100 + hours))
-    assert torch.equal(read(days, units="days")[0], read(days, units="day_of_year")[0])
 
 
 @pytest.mark.parametrize(
