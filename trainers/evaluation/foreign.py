@@ -93,7 +93,7 @@ class ForeignPolicy(TensorDictModuleBase):
                 for key, spec in specs.items(True, True) if began.all() else ():
                     shape = (*tensordict.batch_size, *spec.shape)
                     tensordict.set(key, torch.zeros(shape, dtype=spec.dtype, device=began.device))
-            return self.policy(tensordict).get(keys.ACTION)
+            return self.policy(tensordict)[keys.ACTION]
         if began.all():
             self.state = None
         if isinstance(self.policy, OnnxPolicy):
