@@ -44,10 +44,15 @@ def links(decisions: int, seed: int = 1) -> torch.Tensor:
 
 
 class Twin:
-    """Computes means UAV by UAV and message by message; rounding errors count as constants."""
+    """Computes means UAV by UAV and message by message; rounding errors count as constants.
 
-    def __init__(self, net: Any):
-        self.net = net
+    Args:
+        net: the network.
+        kept: rounding errors of an earlier pass, which are added in place of rounding.
+    """
+
+    def __init__(self, net: Any, kept: list[torch.Tensor] | None = None):
+        self.net, self.kept, self.errors = net, kept, []
 
     def row(self, uav: int) -> int:
         return 0 if self.net.grouping.shared else uav
@@ -57,7 +62,9 @@ class Twin:
 
     def rounded(self, x: torch.Tensor) -> torch.Tensor:
         y = x.tanh()
-        return y + ((y * 127).round() / 127 - y).detach()
+        error = (y * 127).round() / 127 - y if self.kept is None else self.kept[len(self.errors)]
+        self.errors.append(error.detach())
+        return y + error.detach()
 
     def gru(self, uav: int, x: torch.Tensor, h: torch.Tensor) -> torch.Tensor:
         memory = self.net.memory
@@ -124,6 +131,26 @@ def test_means_and_gradients_equal_those_of_a_scalar_twin(scheme, memory, shared
             torch.testing.assert_close(gradient, other)
         if not shared:  # the hearer's own weights say nothing to it, except through others
             assert gradients[0].abs().sum((1, 2)).count_nonzero() >= 2
+
+
+@pytest.mark.parametrize(("scheme", "memory", "shared"), CASES)
+def test_gradients_cross_uavs_as_finite_differences_say(scheme, memory, shared):
+    net, observed, hears = network(scheme, memory, shared), drawn(3, UAVS, FEATURES), links(3)[0]
+    first = Twin(net)
+    first.means(observed, hears)
+    mean, _ = net(net.empty_state(1), observed[None], hears[None])
+    weights = [w for name, w in net.named_parameters() if name.startswith("messages")]
+    gradients = torch.autograd.grad(mean[0, -1, 2].sum(), weights)
+    for weight, gradient in zip(weights, gradients, strict=True):
+        entry = weight.data.view(-1)
+        for index in (0, weight.numel() // 2, weight.numel() - 1):
+            outputs = []
+            for step in (1e-6, -2e-6):
+                entry[index] += step
+                outputs.append(Twin(net, first.errors).means(observed, hears)[-1, 2].sum())
+            entry[index] += 1e-6
+            slope = (outputs[0] - outputs[1]) / 2e-6
+            torch.testing.assert_close(gradient.reshape(-1)[index], slope, rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.parametrize("scheme", ["none", *SCHEMES])
