@@ -235,7 +235,7 @@ TINY = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @pytest.mark.parametrize("setup", ["tuned", "strong", "strong_front"])
 @pytest.mark.parametrize("method", ["consensus", "independent", "maps", "positional"])
 def test_pretrained_policies_as_onnx_files_act_alike_over_an_episode(setup, method, tmp_path):
