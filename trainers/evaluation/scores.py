@@ -35,6 +35,12 @@ def means(measured: Mapping[str, list[float]]) -> dict[str, float]:
     return {name: float(np.mean(values)) for name, values in measured.items()}
 
 
+def validated(line: Mapping[str, float], measure: str) -> float | None:
+    """Returns the mean of a measure over the validation fires in a line, if it has any."""
+    values = [value for name, value in line.items() if name.endswith(f"/{measure}")]
+    return sum(values) / len(values) if values else None
+
+
 def learned_means(results: Results) -> dict[str, float]:
     """Returns "test/fire/measure" -> mean over episodes of the learned policy."""
     return {

@@ -14,6 +14,7 @@ from emberlink.envs.utils.errors import UserError, naming
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.evaluation.scores import validated
 from emberlink.trainers.runs.run_folder import MAX_YAML
 from emberlink.trainers.terminal.signals import Interruption
 from emberlink.trainers.training.resume import resume
@@ -74,7 +75,7 @@ def tune(
 
         def report(state: Progress, trial: Any = trial, trainer: Trainer = trainer) -> None:
             nonlocal pruned
-            value = _value(state.line, headline)
+            value = validated(state.line, headline)
             if value is not None and not state.step % config.env.horizon:
                 trial.report(value, state.episode)
                 if pruned := bool(trial.should_prune()):
@@ -89,7 +90,7 @@ def tune(
         if interruption.received:
             console.print("stopped; the same command continues", soft_wrap=True)
             return interruption.status
-        value = _value(trainer.run.metrics()[-1], headline)
+        value = validated(trainer.run.metrics()[-1], headline)
         if pruned:
             study.tell(trial, state=optuna.trial.TrialState.PRUNED)
         else:
@@ -132,9 +133,3 @@ def _trainer(trial: Any, method: str, overrides: Sequence[str]) -> Trainer:
     trainer = Trainer(resolve(method, overrides))
     trial.set_user_attr(_RUN, str(trainer.start().path))
     return trainer
-
-
-def _value(line: Mapping[str, Any], headline: str) -> float | None:
-    """Returns the mean of a headline over the sets of validation fires, if a line has any."""
-    values = [value for key, value in line.items() if key.endswith(f"/{headline}")]
-    return sum(values) / len(values) if values else None

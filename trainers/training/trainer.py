@@ -11,7 +11,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.evaluation.evaluate_run import evaluate_run
-from emberlink.trainers.evaluation.scores import Results, learned_means
+from emberlink.trainers.evaluation.scores import Results, learned_means, validated
 from emberlink.trainers.learners.base import Losses
 from emberlink.trainers.rollout.finite_actions import NonFiniteActionError
 from emberlink.trainers.runs import checkpoint
@@ -203,10 +203,11 @@ class Trainer:
     def _keep_best(self, line: Mapping[str, Any]) -> None:
         """Writes best.safetensors if the headline measure is the best so far."""
         headline = self.config.evaluation.headline
-        evaluated = [value for name, value in line.items() if name.endswith(f"/{headline}")]
-        if self.config.evaluation.interval and not evaluated:
-            return
-        measured = sum(evaluated) / len(evaluated) if evaluated else line[headline]
+        measured = validated(line, headline)
+        if measured is None:
+            if self.config.evaluation.interval:
+                return
+            measured = line[headline]
         higher = headline in metrics.HIGHER_IS_BETTER
         if self.best is None or (measured > self.best if higher else measured < self.best):
             self.best = measured
