@@ -23,7 +23,6 @@ from torchrl.modules.utils import get_primers_from_module
 
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError, naming
-from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.pretrained import is_name
@@ -209,7 +208,7 @@ def _read(run: RunFolder) -> dict[str, str]:
 
 def is_reference(text: str) -> bool:
     """Returns whether a text names a policy that emberlink has not trained."""
-    return text.endswith(".onnx") or (not is_name(text) and bool(_split(text)[1]))
+    return text.endswith((".onnx", ".py")) or (not is_name(text) and bool(_split(text)[1]))
 
 
 def open_policy(text: str) -> tuple[Any, str]:
@@ -224,16 +223,14 @@ def open_policy(text: str) -> tuple[Any, str]:
         if not (file := Path(text)).is_file():
             raise UserError(f"{text}: there is no such file")
         return OnnxPolicy(file), str(file.absolute())
-    place, name = _split(text)
+    place, name = (text, "") if text.endswith(".py") else _split(text)
     try:
         module = _module(place)
     except Exception as error:
         raise UserError(f"{text}: {type(error).__name__}: {error}") from error
     if not callable(policy := getattr(module, name, None)) or inspect.isclass(policy):
         known = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
-        raise UserError(
-            f"{text}: {shown(name)} is no function or module of {place}; known: {', '.join(known)}"
-        )
+        raise UserError(f"{text}: expected {place}:NAME of a function; known: {', '.join(known)}")
     return policy, f"{Path(str(module.__file__)).absolute()}:{name}"
 
 

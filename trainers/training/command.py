@@ -9,7 +9,7 @@ from rich.console import Console
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.config.compose import differences, resolve
 from emberlink.trainers.evaluation.scores import print_results, reporter
 from emberlink.trainers.terminal.progress import TrainingProgress
 from emberlink.trainers.terminal.signals import Interrupted, Interruption
@@ -114,6 +114,10 @@ def _notes(trainer: Trainer) -> Iterator[str]:
             f"learner={learner.name} has no replay buffer to share: {config.method} trains as "
             "independent does"
         )
+    usual = resolve("independent", [f"setup={config.setup}", f"world={config.world}"])
+    rewards = {k: v for k, v in differences(config, usual).items() if k.startswith("env.reward.")}
+    for key, (own, other) in rewards.items():
+        yield f"{key} is {own} here and {other} for independent: their rewards do not compare"
 
 
 def _train(trainer: Trainer, console: Console) -> None:
