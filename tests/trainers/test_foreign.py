@@ -111,7 +111,7 @@ def test_a_dictionary_where_an_observation_has_several_tensors():
     [
         ("mine.py:fails", r"mine: ValueError: no fuel \(.*mine.py:13\)"),
         ("mine.py:shrinks", r"mine: .*\[3, 3\]; expected \[50, 3, 3\]"),
-        ("mine.py:rises", "rises is no function.*known: rise, turn"),
+        ("mine.py:rises", "known: rise, turn"),
         ("no.py:rise", "no.py:rise: FileNotFoundError"),
         ("no.onnx", "no.onnx: there is no such file"),
     ],
