@@ -152,8 +152,8 @@ def evaluate(
         loaded = load(policy, checkpoint=checkpoint, device=device, **settings)
         config, actor = loaded.config, loaded.actor
     else:
-        if isinstance(policy, str):
-            policy, reference = open_policy(policy)
+        if isinstance(policy, (str, os.PathLike)):
+            policy, reference = open_policy(os.fspath(policy))
         chosen = [f"{key}={settings.pop(key)}" for key in GROUPS if key in settings]
         settings |= {} if device is None else {"device": device}
         config = foreign_config(policy, method, chosen, **settings)

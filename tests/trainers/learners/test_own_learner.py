@@ -7,8 +7,10 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import yaml
 from test_contract import check_that_it_learns_and_resumes
 
+from emberlink import trainers
 from emberlink.envs.utils import config_files
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.setup import TrainingSetup
@@ -45,3 +47,17 @@ def made() -> TrainingSetup:
 def test_the_learner_of_the_page_trains_all_weights_and_resumes_bit_for_bit(sac):
     assert "log_alpha" in dict(made().learner.loss.named_parameters())
     check_that_it_learns_and_resumes(made)
+
+
+def test_its_run_is_exported_flown_and_resumed(sac, tmp_path):
+    pytest.importorskip("onnxscript")
+    values = dict(text.split("=", 1) for text in SMALL)
+    small = {key: yaml.safe_load(text) for key, text in values.items()}
+    short = {"evaluation.episodes": 1, "evaluation.scripted": []}
+    run = trainers.train("consensus", **small, **short, output=tmp_path / "runs")
+    onnx, _ = trainers.export(run.path, tmp_path / "sac.onnx")
+    world = {"setup": "tuned", "env.horizon": 20, "env.num_uavs": 3}
+    flown = trainers.evaluate(onnx, "consensus", episodes=1, scripted=False, **world)
+    for measure, value in run.results["huygens"]["learned"].items():
+        assert flown["huygens"]["learned"][measure] == value
+    assert trainers.resume(run.path, episodes=3).config.episodes == 3
