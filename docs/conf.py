@@ -1,10 +1,12 @@
 """Configures the documentation site: `make docs` builds it into build/docs."""
 
+import re
 import sys
 from importlib.metadata import version as installed
 from pathlib import Path
+from typing import Any
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE / "site"))
 
 from sphinx.ext.napoleon.docstring import GoogleDocstring  # noqa: E402
@@ -20,16 +22,13 @@ extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "maths",
     "reference_pages",
-    "source_links",
 ]
 exclude_patterns = ["data", "site"]
 nitpicky = False
 
 myst_heading_anchors = 4
-myst_enable_extensions = ["colon_fence", "dollarmath"]
-html_math_renderer = "mathml"
+myst_enable_extensions = ["colon_fence"]
 nb_execution_mode = "force"
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
@@ -58,3 +57,24 @@ html_theme_options = {
     "footer_end": [],
 }
 copyright = "2026, the emberlink authors, MIT licence"
+
+LINK = re.compile(r"\[(?P<text>[^\]]+)\]\((?P<target>(?!https?:)[^)\s#]+)(?:#[^)]*)?\)")
+
+
+def setup(app: Any) -> None:
+    """Shows links to files outside of the site, which Sphinx would copy, as paths."""
+    app.connect("source-read", _show_paths)
+
+
+def _show_paths(_: Any, page: str, source: list[str]) -> None:
+    folder = (HERE / page).parent
+
+    def shown(link: re.Match[str]) -> str:
+        target = (folder / link["target"]).resolve()
+        in_site = target.is_relative_to(HERE) and not target.is_relative_to(HERE / "data")
+        if in_site or not target.exists():
+            return link[0]  # a link to nowhere is a warning of Sphinx
+        path, text = str(target.relative_to(HERE.parent)), link["text"].strip("`")
+        return f"`{path}`" if text in path else f"{link['text']} (`{path}`)"
+
+    source[0] = LINK.sub(shown, source[0])

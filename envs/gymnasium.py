@@ -41,13 +41,14 @@ class WildfireTeamEnv(gymnasium.Env[Any, NDArray[np.float32]]):
         self._ended = False, False
         uavs = len(self._team.possible_agents)
         self.observation_space: Space[Any] = self._team.state_space
-        one = self._team.observation_space(self._team.possible_agents[0])
+        one: Any = self._team.observation_space("uav_0")
         if isinstance(one, Dict):
-            spaces: dict[str, Space[Any]] = {keys.OBSERVATION[1]: self._team.state_space}
-            for name, box in one.items():
-                if isinstance(box, Box) and name not in spaces:
-                    spaces[name] = Box(0, int(box.high.max()), (uavs, *box.shape), np.uint8)
-            self.observation_space = Dict(spaces)
+            pictures = {k: box for k, box in one.items() if k != keys.OBSERVATION[1]}
+            spaces = {
+                k: Box(0, box.high.max(), (uavs, *box.shape), np.uint8)
+                for k, box in pictures.items()
+            }
+            self.observation_space = Dict({keys.OBSERVATION[1]: self._team.state_space, **spaces})
         self.action_space = Box(-1.0, 1.0, (3 * uavs,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):

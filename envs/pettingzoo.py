@@ -1,7 +1,7 @@
 """The environment for PettingZoo: a `ParallelEnv` over `WildfireEnv`."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from copy import deepcopy
 from typing import Any, ClassVar
 
@@ -11,15 +11,13 @@ from gymnasium.spaces import Box, Dict, Space
 from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
-from pydantic import ValidationError
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase, TransformedEnv, step_mdp
+from torchrl.envs import EnvBase, step_mdp
 
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import default_config
 from emberlink.envs.utils.errors import UserError, shown
-from emberlink.envs.utils.validation import describe
 from emberlink.envs.wildfire import WildfireEnv
 
 Array = NDArray[np.float32]
@@ -54,10 +52,7 @@ def parallel_env(
     if env is None:
         scaled = dataclasses.replace(default_config(kwargs.get("fire")), observation_scale="box")
         config = kwargs.pop("config", None) or scaled
-        try:
-            config = dataclasses.replace(config, horizon=max_cycles or config.horizon)
-        except ValidationError as error:
-            raise UserError(f"max_cycles: {describe(error)}") from None
+        config = dataclasses.replace(config, horizon=max_cycles or config.horizon)
         env = WildfireEnv(**{"num_envs": 1, "config": config, **kwargs})
     return WildfireParallelEnv(env, render_mode)
 
@@ -93,18 +88,15 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         known = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in known:
             raise UserError(f"render_mode {render_mode!r} is not known; known: {known}")
-        core = env.base_env if isinstance(env, TransformedEnv) else env
-        if not isinstance(core, WildfireEnv):
-            raise UserError(f"env: a WildfireEnv is needed, got {type(core).__name__}")
         if env.batch_size != (1,):
             raise UserError(f"env: a batch size of [1] is needed, got {list(env.batch_size)}")
         self.render_mode = render_mode
-        self._env, self._core, self._window = env, core, None
+        self._env, self._core = env, getattr(env, "base_env", env)
         self._now: TensorDictBase | None = None
         self._unplayed: int | None = None
-        self.possible_agents = core.group_map[keys.AGENTS]
+        self.possible_agents = self._core.group_map[keys.AGENTS]
         self.agents: list[str] = []
-        vector, space = observation_space(env, core.config)
+        vector, space = observation_space(env, self._core.config)
         # One space object per agent, kept: PettingZoo seeds and compares them by identity.
         self.observation_spaces = {agent: deepcopy(space) for agent in self.possible_agents}
         self.action_spaces: dict[str, Space] = {
@@ -134,19 +126,18 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             options: "position", start positions in cells, [num_uavs, 3].
 
         Raises:
-            UserError: another option, or positions outside of the box.
+            UserError: positions outside of the box.
         """
         options = dict(options or {})
         options.pop("options", None)  # PettingZoo's own tests pass {"options": 1}
-        if wrong := sorted(set(options) - {"position"}):
-            raise UserError(f"options: {', '.join(wrong)} not known; known: position")
         self._unplayed = self._unplayed if seed is None else seed
         if self._unplayed is not None:
             self._env.set_seed(self._unplayed)
         self._now = self._env.reset(**options)
         self.agents = list(self.possible_agents)
         self._show()
-        return self._observations(), self._infos(self._now)
+        infos = self._of(self.agents, self._infos(self._now))
+        return self._of(self.agents, self._observations()), infos
 
     def step(
         self, actions: dict[str, Array]
@@ -166,28 +157,22 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             UserError: an agent is not known, an action of a live agent is missing, does not have
                 three numbers or holds NaN.
         """
-        now = self._begun("step")
-        if not self.agents:
+        now, flew = self._begun(), self.agents
+        if not flew:
             return {}, {}, {}, {}, {}
         action, self._unplayed = self._stacked(actions), None
         now.set(keys.ACTION, torch.from_numpy(action[None]).to(self._core.device))
         stepped = self._env.step(now)
         self._now = step_mdp(stepped, keep_other=True)
         after = stepped.get("next")
-        earned = after.get(keys.REWARD)[0, :, 0].tolist()
-        rewards = dict(zip(self.possible_agents, earned, strict=True))
-        lives = dict(zip(self.possible_agents, after.get(keys.ALIVE)[0].tolist(), strict=True))
-        flew, truncated = self.agents, bool(after.get("truncated"))
-        self.agents = [] if truncated else [agent for agent in flew if lives[agent]]
+        rewards = self._of(flew, after.get(keys.REWARD)[0, :, 0].tolist())
+        failed = self._of(flew, (~after.get(keys.ALIVE)[0]).tolist())
+        truncated = bool(after.get("truncated"))
+        self.agents = [] if truncated else [agent for agent in flew if not failed[agent]]
         self._show()
-        observations, infos = self._observations(), self._infos(after)
-        return (
-            {agent: observations[agent] for agent in flew},
-            {agent: rewards[agent] for agent in flew},
-            {agent: not lives[agent] for agent in flew},
-            dict.fromkeys(flew, truncated),
-            {agent: infos[agent] for agent in flew},
-        )
+        observations = self._of(flew, self._observations())
+        infos = self._of(flew, self._infos(after))
+        return observations, rewards, failed, dict.fromkeys(flew, truncated), infos
 
     def act(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> dict[str, Array]:
         """Returns the actions of a policy for `step`; each call moves its memory one step on.
@@ -197,29 +182,25 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         Args:
             policy: writes ("agents", "action"), such as `emberlink.trainers.load` returns.
         """
-        now = self._begun("act")
         if not self.agents:
             return {}
         with torch.no_grad():
-            self._now = policy(now)
-        actions = self._now.get(keys.ACTION)[0].cpu().numpy().copy()
-        chosen = dict(zip(self.possible_agents, actions, strict=True))
-        return {agent: chosen[agent] for agent in self.agents}
+            self._now = policy(self._begun())
+        return self._of(self.agents, self._now.get(keys.ACTION)[0].cpu().numpy().copy())
 
     def state(self) -> Array:
         """Returns the vectors of all UAVs one after another, float32 [n * features]."""
-        now = self._begun("state")
-        return now.get(keys.OBSERVATION)[0].flatten().cpu().numpy().copy()
+        return self._begun().get(keys.OBSERVATION)[0].flatten().cpu().numpy().copy()
 
     def pictures(self) -> dict[str, NDArray[np.uint8]]:
         """Returns the other tensors of the observations of all UAVs, uint8 [n, ...], by name."""
-        now = self._begun("pictures")
+        now = self._begun()
         _, *others = keys.observation_keys(self._env.observation_spec)
         return {k[1]: now.get(k)[0].to(torch.uint8).cpu().numpy().copy() for k in others}
 
     def counts(self) -> dict[str, int]:
         """Returns the numbers of cells `seen`, `burning` and `burnt`."""
-        now = self._begun("counts")
+        now = self._begun()
         return {key: int(now.get(key)) for key in (keys.SEEN, keys.BURNING, keys.BURNT)}
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -231,26 +212,39 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         if self.render_mode is None:
             known = self.metadata["render_modes"]
             raise UserError(f"render() needs a render_mode; known: {known}")
+        picture = self._core.render()
         if self.render_mode == "rgb_array":
-            return self._core.render()
-        self._window = self._window or _Window()
-        return self._window.show(self._core.render())
+            return picture
+        from matplotlib import pyplot  # imported here, since it takes a second
+
+        window = pyplot.figure(self._window, clear=True)
+        window.add_axes((0, 0, 1, 1), frame_on=False, xticks=[], yticks=[]).imshow(picture)
+        window.show(warn=False)  # nothing without a display
+        window.canvas.flush_events()
+        return None
 
     def close(self) -> None:
         """Closes the window, if there is one."""
-        if self._window is not None:
-            self._window.close()
-            self._window = None
+        if self.render_mode == "human":
+            from matplotlib import pyplot
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Returns the state for copies, which have no window until they are rendered."""
-        return {**self.__dict__, "_window": None}
+            pyplot.close(self._window)
 
-    def _begun(self, caller: str) -> TensorDictBase:
+    @property
+    def _window(self) -> str:
+        """The title of the window, of which each environment has its own."""
+        return f"{self.metadata['name']} {id(self)}"
+
+    def _begun(self) -> TensorDictBase:
         """Returns the current time step."""
         if self._now is None:
-            raise UserError(f"no episode is running: call reset() before {caller}()")
+            raise UserError("no episode is running: call reset() first")
         return self._now
+
+    def _of(self, agents: list[str], values: Iterable[Any]) -> dict[str, Any]:
+        """Returns the values of some agents, of those of all."""
+        every = zip(self.possible_agents, values, strict=True)
+        return {agent: value for agent, value in every if agent in agents}
 
     def _show(self) -> None:
         if self.render_mode == "human":
@@ -265,52 +259,21 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         hover = np.zeros(3, np.float32)
         return np.stack([given.get(agent, hover) for agent in self.possible_agents])
 
-    def _observations(self) -> dict[str, Observation]:
+    def _observations(self) -> list[Observation]:
         vectors = self.state().reshape(len(self.possible_agents), -1)
         pictures = self.pictures()
         if not pictures:
-            return dict(zip(self.possible_agents, vectors, strict=True))
-        return {
-            agent: {keys.OBSERVATION[1]: vectors[i], **{k: v[i] for k, v in pictures.items()}}
-            for i, agent in enumerate(self.possible_agents)
-        }
+            return [*vectors]
+        return [
+            {keys.OBSERVATION[1]: vector, **{key: value[i] for key, value in pictures.items()}}
+            for i, vector in enumerate(vectors)
+        ]
 
-    def _infos(self, td: TensorDictBase) -> dict[str, dict[str, Any]]:
-        agents = td.get(keys.AGENTS)
-        values = {
-            key: agents.get(key)[0].cpu().numpy().copy()
-            for key in agents.keys()  # noqa: SIM118  (a TensorDict iterates over its rows)
-            if key not in _NOT_INFO
-        }
-        shared = self.counts()
-        return {
-            agent: {key: value[i] for key, value in values.items()} | shared
-            for i, agent in enumerate(self.possible_agents)
-        }
-
-
-class _Window:
-    """Shows pictures in a matplotlib window; nothing is shown without a display."""
-
-    def __init__(self) -> None:
-        from matplotlib import pyplot  # imported here, since it takes a second
-
-        self._pyplot, self._figure = pyplot, pyplot.figure()
-        manager: Any = self._figure.canvas.manager
-        manager.set_window_title(WildfireParallelEnv.metadata["name"])
-        self._image: Any = None
-
-    def show(self, picture: NDArray[np.uint8]) -> None:
-        if self._image is None:
-            axes = self._figure.add_axes((0, 0, 1, 1), frame_on=False, xticks=[], yticks=[])
-            self._image = axes.imshow(picture)
-            self._figure.show(warn=False)
-        self._image.set_data(picture)
-        self._figure.canvas.draw_idle()
-        self._figure.canvas.flush_events()
-
-    def close(self) -> None:
-        self._pyplot.close(self._figure)
+    def _infos(self, td: TensorDictBase) -> list[dict[str, Any]]:
+        told, shared = td.get(keys.AGENTS)[0].exclude(*_NOT_INFO), self.counts()
+        values = {key: value.cpu().numpy().copy() for key, value in told.items()}
+        rows = range(len(self.possible_agents))
+        return [{key: value[i] for key, value in values.items()} | shared for i in rows]
 
 
 def to_action(action: Any, size: int, agent: str = "the team") -> Array:

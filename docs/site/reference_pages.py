@@ -5,10 +5,11 @@ import inspect
 import math
 import re
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, fields, is_dataclass
-from typing import Any, ClassVar
+from typing import Any
 
+import yaml
 from docutils import nodes
 from pydantic import TypeAdapter
 from sphinx.application import Sphinx
@@ -18,6 +19,7 @@ from sphinx.util.docutils import SphinxDirective
 from emberlink.comm.base import MODULES
 from emberlink.envs import FileFireConfig, FireConfig, ReactionConfig, metrics
 from emberlink.trainers import RunConfig, resolve
+from emberlink.trainers.cli.list import described
 from emberlink.trainers.cli.main import _parser
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.learners.base import LEARNERS
@@ -42,57 +44,46 @@ _SKIPPED = {"comm", "learner", "fire", "saved_copy", "sha256", "test_sha256"}
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Registers the directives."""
-    app.add_directive("configuration-keys", ConfigurationKeys)
-    app.add_directive("measures", Measures)
-    app.add_directive("command-help", CommandHelp)
-    app.add_directive("choices", Choices)
+    """Registers a directive for each function that returns Markdown."""
+    for text in (configuration_keys, measures, command_help, choices):
+        app.add_directive(text.__name__.replace("_", "-"), _directive(text))
     return {"parallel_read_safe": True}
 
 
-class _Generated(SphinxDirective):
-    """A directive whose content is Markdown that `text` returns."""
+def _directive(text: Callable[..., str]) -> type[SphinxDirective]:
+    class Generated(SphinxDirective):
+        optional_arguments = 2
 
-    required_arguments: ClassVar[int] = 0
-    optional_arguments: ClassVar[int] = 1
+        def run(self) -> list[nodes.Node]:
+            return self.parse_text_to_nodes(text(*self.arguments), allow_section_headings=True)
 
-    def text(self) -> str:
-        """Returns the content."""
-        raise NotImplementedError
-
-    def run(self) -> list[nodes.Node]:
-        return self.parse_text_to_nodes(self.text(), allow_section_headings=True)
+    return Generated
 
 
-class ConfigurationKeys(_Generated):
-    """A table of keys: `run`, `learner NAME`, `comm NAME`, `executor NAME` or `fire KIND`."""
-
-    optional_arguments = 2
-
-    def text(self) -> str:
-        kind, name = [*self.arguments, ""][:2]
-        rows = list(_rows(kind, name))
-        head = "| key | default | meaning; type and range |\n|---|---|---|\n"
-        return head + "\n".join(f"| {' | '.join(row)} |" for row in rows)
+def configuration_keys(kind: str, name: str = "") -> str:
+    """Returns a table of keys: `run`, `learner NAME`, `comm NAME`, `executor NAME`, `fire KIND`."""
+    head = "| key | default | meaning; type and range |\n|---|---|---|\n"
+    return head + "\n".join(f"| {' | '.join(row)} |" for row in _rows(kind, name))
 
 
-class Measures(_Generated):
-    """A table of all measures."""
-
-    def text(self) -> str:
-        lines = ["| measure | better | meaning |", "|---|---|---|"]
-        for name in metrics.ALL:
-            better = "more" if name in metrics.HIGHER_IS_BETTER else "less"
-            lines.append(f"| `{name}` | {better} | {_first(getattr(metrics, name).__doc__)} |")
-        return "\n".join(lines)
+def measures() -> str:
+    """Returns a table of all measures."""
+    lines = ["| measure | better | meaning |", "|---|---|---|"]
+    for name in metrics.ALL:
+        better = "more" if name in metrics.HIGHER_IS_BETTER else "less"
+        lines.append(f"| `{name}` | {better} | {_first(getattr(metrics, name).__doc__)} |")
+    return "\n".join(lines)
 
 
-class CommandHelp(_Generated):
-    """The help of every command."""
+def command_help() -> str:
+    """Returns the help of every command."""
+    first, *others = _helps(_parser()[0])
+    return "\n\n".join([first[1], *(f"## {name}\n\n{text}" for name, text in others)])
 
-    def text(self) -> str:
-        first, *others = _helps(_parser()[0])
-        return "\n\n".join([first[1], *(f"## {name}\n\n{text}" for name, text in others)])
+
+def choices(kind: str) -> str:
+    """Returns the names that `emberlink list KIND` prints, with their descriptions."""
+    return "\n".join(f"- `{name}`: {text}" for name, text in described(kind))
 
 
 def _helps(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
@@ -102,18 +93,6 @@ def _helps(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
         if isinstance(action, argparse._SubParsersAction):
             for command in action.choices.values():
                 yield from _helps(command)
-
-
-class Choices(_Generated):
-    """The names that `emberlink list KIND` prints, with their descriptions."""
-
-    required_arguments = 1
-
-    def text(self) -> str:
-        from emberlink.trainers.cli.list import described
-
-        lines = [f"- `{name}`: {text}" for name, text in described(self.arguments[0])]
-        return "\n".join(lines)
 
 
 def _rows(kind: str, name: str) -> Iterator[tuple[str, ...]]:
@@ -141,11 +120,8 @@ def _keys(cls: type, prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[s
             yield from _keys(hints[name], f"{prefix}{name}.", values.get(name, {}))
             continue
         about = schema["properties"][name]
-        default = about.get("default", MISSING)
-        factory = cls.__pydantic_fields__[name].default_factory
-        if factory is not None:
-            default = factory()
-        default = values.get(name, default)
+        empty = {} if cls.__pydantic_fields__[name].default_factory else MISSING
+        default = values.get(name, about.get("default", empty))
         shown = "by choice" if default is MISSING else f"`{_plain(default)}`"
         yield f"`{prefix}{name}`", shown, f"{meanings.get(name, '')}; {_type(about)}"
 
@@ -186,13 +162,7 @@ def _type(schema: Mapping[str, Any]) -> str:
 
 def _plain(value: Any) -> str:
     """Returns a value as YAML shows it."""
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_plain, value))}]"
-    if isinstance(value, float):
-        return ".inf" if math.isinf(value) else f"{value:g}"
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    return str(value)
+    return yaml.safe_dump([value], default_flow_style=True, width=math.inf)[1:-2]
 
 
 def _first(doc: str | None) -> str:

@@ -83,11 +83,3 @@ def test_no_line_is_a_comment():
     """MyST leaves out a line of text that begins with a percent sign, such as a wrapped `98 %`."""
     comment = re.compile(r"^\s*%.*", re.M)
     assert [line for text in TEXTS.values() for line in comment.findall(text)] == []
-
-
-def test_formulas_can_be_drawn_without_the_network():
-    from docutils.utils.math.latex2mathml import tex2mathml
-
-    formulas = re.findall(r"\$\$(.+?)\$\$", "".join(TEXTS.values()), re.S)
-    assert formulas
-    assert all("<mfrac>" in tex2mathml(formula, as_block=True) for formula in formulas)

@@ -9,14 +9,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.cli.parser import (
-    MOST_FIRES,
-    between,
-    command,
-    command_group,
-    path,
-    positive,
-)
+from emberlink.trainers.cli.parser import between, command, command_group, path, positive, run_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -35,7 +28,7 @@ def add_train(commands: Any) -> None:
     add = command(
         commands,
         "train",
-        _train,
+        _checked("training.command:train"),
         "train one of the methods and evaluate it",
         "Trains a method, evaluates the frozen policies on test fires, and writes a run folder "
         "with config.yaml, metrics.jsonl, checkpoints, eval.json, figures, GIF and replay page.",
@@ -60,11 +53,14 @@ def _add_overrides(add: Callable[..., Any], text: str) -> None:
     add("overrides", metavar="key=value", nargs="*", default=[], help=text)
 
 
-def _train(options: argparse.Namespace, console: "Console") -> int:
-    _check_names(options.method, options.overrides)
-    from emberlink.trainers.training.command import train
+def _checked(place: str) -> Callable[[argparse.Namespace, "Console"], int]:
+    """Returns a function that checks names and keys, then runs `place` (see `run_of`)."""
 
-    return train(options.method, options.overrides, console)
+    def run(options: argparse.Namespace, console: "Console") -> int:
+        _check_names(options.method, options.overrides)
+        return run_of(place)(options, console)
+
+    return run
 
 
 def _check_names(method: str, overrides: list[str]) -> None:
@@ -90,7 +86,7 @@ def add_eval(commands: Any) -> None:
     add = command(
         commands,
         "eval",
-        _eval,
+        "evaluation.evaluate_run:run_command",
         "evaluate the frozen policies of a run, or a policy of your own",
         "Plays the policies of a run's newest checkpoint and the scripted ones on the same test "
         "fires, prints a table, and writes eval.json, figures, GIF and replay page to the run. A "
@@ -113,15 +109,8 @@ def add_eval(commands: Any) -> None:
     )
     add("--name", help="what comparisons call a policy of your own")
     add("--checkpoint", metavar="FILE", type=path, help="a checkpoint (default: the newest)")
-    fires = between(1, MOST_FIRES)
-    add("--fires", metavar="N", type=fires, help="number of episodes (default: the run's)")
+    add("--fires", metavar="N", type=positive, help="number of episodes (default: the run's)")
     add("--device", help="cpu, cuda, ... (default: the run's)")
-
-
-def _eval(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.trainers.evaluation.evaluate_run import run_command
-
-    return run_command(options, console)
 
 
 def add_export(commands: Any) -> None:
@@ -204,7 +193,7 @@ def add_render(commands: Any) -> None:
     add = command(
         commands,
         "render",
-        _render,
+        "evaluation.render:render",
         "an episode as GIF and MP4, or as a page to play; several runs side by side",
         "Plays the frozen policies of runs on the same held-out fire from the same start "
         "positions. Writes a GIF and an MP4 to the first run's figures, or with --output FILE.html "
@@ -230,25 +219,18 @@ def add_render(commands: Any) -> None:
     add("--checkpoint", type=path, **about, **several)
     kinds = "a folder, or a new file: .html (a page to play), .gif, .mp4 or .png (one picture)"
     add("--output", metavar="PATH", type=path, help=kinds)
-    steps = between(0, 1_000_000)
-    add("--step", metavar="STEP", type=steps, help="step of a .png (default: the last)")
+    add("--step", metavar="STEP", type=between(0), help="step of a .png (default: the last)")
     add("--frames", type=positive, default=126, help="maximum number of frames (default: 126)")
     add("--fps", type=between(1, 50), default=12, help="frames per second, 1 to 50 (default: 12)")
     add("--size", type=between(100, 2000), help="pixels of a map's longer side, 100 to 2000")
     add("--seen", action="store_true", help="draw seen fire in grey")
 
 
-def _render(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.trainers.evaluation.render import render
-
-    return render(options, console)
-
-
 def add_sweep(commands: Any) -> None:
     add = command(
         commands,
         "sweep",
-        _sweep,
+        "sweep.command:sweep",
         "train methods x seeds x setups",
         "Trains and evaluates every combination, several runs at a time. Finished runs in the "
         "output folder are skipped, and stopped ones are resumed by the same command.",
@@ -266,18 +248,11 @@ def add_sweep(commands: Any) -> None:
     add("--dry-run", action="store_true", help="only print the state of each run")
 
 
-def _sweep(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.trainers.sweep.command import sweep
-
-    jobs = [f"executor.workers={options.jobs}"] if options.jobs else []
-    return sweep([*options.arguments, *jobs], console, dry=options.dry_run)
-
-
 def add_tune(commands: Any) -> None:
     add = command(
         commands,
         "tune",
-        _tune,
+        _checked("sweep.tune:tune"),
         "choose a method's settings by validation fires",
         "Trains a method again and again with settings that Optuna chooses, stops trainings that "
         "are below the median, and prints the best settings. Trials are runs in "
@@ -289,14 +264,6 @@ def add_tune(commands: Any) -> None:
     add("--trials", metavar="N", type=positive, default=20, help="number of trials (default: 20)")
     what = "a YAML file of keys and values to try (default: that of the learner in configs/space)"
     add("--space", metavar="FILE", type=path, help=what)
-
-
-def _tune(options: argparse.Namespace, console: "Console") -> int:
-    _check_names(options.method, options.overrides)
-    from emberlink.trainers.sweep.tune import tune
-
-    chosen = {"space": options.space, "trials": options.trials}
-    return tune(options.method, options.overrides, console, **chosen)
 
 
 def add_world(commands: Any) -> None:
@@ -324,8 +291,7 @@ def add_world(commands: Any) -> None:
         help="worlds (default: all that evaluate the needed policies); keys of the world to "
         "change, such as fire.burn_time=90 or setup=tuned",
     )
-    number = between(1, MOST_FIRES)
-    add("--fires", metavar="N", type=number, default=100, help="number of fires (default: 100)")
+    add("--fires", metavar="N", type=positive, default=100, help="number of fires (default: 100)")
     on_validation = {"const": "validation", "default": "test", "action": "store_const"}
     why = "play on validation fires, for the design of a world, in place of test fires"
     add("--validation", dest="split", help=why, **on_validation)

@@ -1,4 +1,4 @@
-"""Completes commands, methods and runs in a shell; the library argcomplete does the rest."""
+"""Completes commands, methods and runs for the script of `register-python-argcomplete`."""
 
 import argparse
 import glob
@@ -8,18 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from emberlink.envs.utils import config_files
-
-SHELLS = ("bash", "zsh", "fish")
-
-
-class PrintScript(argparse.Action):
-    """Prints the script of a shell."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, *_: Any) -> None:
-        from argcomplete.shell_integration import shellcode
-
-        print(shellcode(["emberlink"], shell=values))
-        parser.exit()
 
 
 def answer(parser: argparse.ArgumentParser) -> None:

@@ -6,14 +6,12 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import Any, NoReturn
 
 from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.utils.errors import UserError, one_line
-
-MOST_FIRES = 65_536
-"""largest number of fires of an evaluation: `config.basics.MAX_FIRES`, without its imports"""
 
 
 class _Help(argparse.HelpFormatter):
@@ -65,9 +63,8 @@ def command(
 ) -> Callable[..., Any]:
     """Adds a command, such as "world check", and returns the function that adds its arguments.
 
-    `run` returns the exit status. It is called with the options and a console, or is
-    `module:function` of emberlink.trainers, which is imported when the command runs and called with
-    the options and the console as keyword arguments.
+    `run` is called with the options and a console, and returns the exit status; a text as for
+    `run_of`.
     """
     parser = commands.add_parser(
         name.split()[-1],
@@ -78,24 +75,30 @@ def command(
         formatter_class=_Help,
     )
 
-    def call(options: argparse.Namespace, console: Any) -> int:
-        module, _, function = str(run).partition(":")
-        own = {k: v for k, v in vars(options).items() if k not in ("run", "command", "action")}
-        called = getattr(import_module(f"emberlink.trainers.{module}"), function)
-        return called(console=console, **own)
-
-    parser.set_defaults(run=call if isinstance(run, str) else run, command=name)
+    parser.set_defaults(run=run_of(run) if isinstance(run, str) else run, command=name)
     return parser.add_argument
+
+
+def run_of(place: str) -> Callable[[argparse.Namespace, Any], int]:
+    """Returns a function that imports `module:function` of emberlink.trainers and calls it.
+
+    With a parameter `options` it gets all of them, else each as a keyword argument.
+    """
+
+    def run(options: argparse.Namespace, console: Any) -> int:
+        module, _, name = place.partition(":")
+        function = getattr(import_module(f"emberlink.trainers.{module}"), name)
+        if "options" in signature(function).parameters:
+            return function(options=options, console=console)
+        own = {k: v for k, v in vars(options).items() if k not in ("run", "command", "action")}
+        return function(console=console, **own)
+
+    return run
 
 
 def command_group(commands: Any, name: str, summary: str, description: str, example: str) -> Any:
     """Adds a command with subcommands, which alone prints its help; returns their group."""
-
-    def print_help(_: argparse.Namespace, console: Any) -> int:
-        console.print(group.format_help(), soft_wrap=True, end="")
-        return 0
-
-    command(commands, name, print_help, summary, description, example)
+    command(commands, name, lambda *_: group.print_help() or 0, summary, description, example)
     group = commands.choices[name]
     return group.add_subparsers(dest="action", metavar="ACTION")
 

@@ -27,22 +27,24 @@ def sweep(
     arguments: Sequence[str],
     console: Console,
     *,
-    dry: bool = False,
+    jobs: int | None = None,
+    dry_run: bool = False,
     executor: Executor | None = None,
 ) -> int:
-    """Trains and evaluates the runs that are not finished, or only prints their states if `dry`.
+    """Trains and evaluates the runs that are not finished, or only prints their states.
 
     `arguments` as for `combinations`, and also `executor=NAME` and `executor.KEY=VALUE`, which
-    `executor` replaces. Returns 1 if a run failed, 128 and the number of a signal after it, else 0.
+    `executor` replaces; `jobs` is `executor.workers`. Returns 1 if a run failed, 128 and the number
+    of a signal after it, else 0.
     """
     chosen = [text for text in arguments if text.startswith(("executor=", "executor."))]
     runs = combinations([text for text in arguments if text not in chosen])
-    executor = executor or make(chosen)
+    executor = executor or make([*chosen, *([f"executor.workers={jobs}"] if jobs else [])])
     output = user_path(runs[0].config.output)
     for note in find_folders(runs, output):
         console.print(f"note: {note}", style="yellow", soft_wrap=True)
     _check([run for run in runs if run.folder is None])
-    if dry:
+    if dry_run:
         console.print(_table(runs))
         return 0
     done = sum(run.finished for run in runs)

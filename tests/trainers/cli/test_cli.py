@@ -6,7 +6,7 @@ import warnings
 import pytest
 from tiny_run import TINY
 
-from emberlink.trainers.cli import commands, main
+from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs import checkpoint
 from emberlink.trainers.runs.run_folder import RunFolder
@@ -66,11 +66,11 @@ def test_an_internal_error_keeps_its_traceback(monkeypatch):
 def test_a_warning_is_one_line_and_printed_once(monkeypatch):
     said = []
 
-    def warn(*_) -> int:
+    def warn(**_) -> int:
         said.extend(warnings.formatwarning("two\nlines", UserWarning, "x.py", 3) for _ in "ab")
         return 0
 
-    monkeypatch.setattr(commands, "_sweep", warn)
+    monkeypatch.setattr("emberlink.trainers.sweep.command.sweep", warn)
     assert main.main(["sweep", "consensus"]) == 0
     assert said == ["emberlink: warning: two lines\n", ""]
 

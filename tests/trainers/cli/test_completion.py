@@ -7,9 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from emberlink.trainers.cli import main
-from emberlink.trainers.cli.completion import SHELLS
-
 PROGRAM = "import sys; from emberlink.trainers.cli.main import main; sys.exit(main())"
 
 
@@ -49,11 +46,3 @@ def completed(line: str, folder: Path) -> list[str]:
 def test_commands_and_names_are_completed(line, expected, tmp_path):
     (tmp_path / "runs").mkdir()
     assert set(completed(line, tmp_path)) == expected
-
-
-@pytest.mark.parametrize("shell", SHELLS)
-def test_a_shells_script_is_printed(shell, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main.main(["--completion", shell])
-    assert ended.value.code == 0
-    assert "emberlink" in capsys.readouterr().out
