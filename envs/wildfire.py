@@ -17,7 +17,7 @@ from emberlink.envs.scenarios import ScenarioConfig, default_config, load_fires
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import check_device, check_whole
+from emberlink.envs.utils.validation import check_device
 from emberlink.envs.world import motion
 from emberlink.envs.world.coverage_map import CoverageMap, Sighting
 from emberlink.envs.world.failures import draw_failures
@@ -100,13 +100,12 @@ class WildfireEnv(EnvBase):
         agent_done: bool = False,
         true_map: bool = False,
     ):
-        num_envs = check_whole("num_envs", num_envs)
         if num_envs < 1:
             raise UserError(f"num_envs={num_envs}: expected at least 1")
         check_device(str(device))
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.config = default_config(fire) if config is None else config
-        self.hold = check_whole("hold", hold)
+        self.hold = hold
         if self.hold < 1 or self.config.horizon % self.hold:
             raise UserError(
                 f"hold={hold}: expected a divisor of the horizon, {self.config.horizon} steps"

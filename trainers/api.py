@@ -12,7 +12,6 @@ from typing import Any
 
 from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import check_whole
 from emberlink.trainers.comparison.comparison import Comparison, compare_runs
 from emberlink.trainers.comparison.report import free_folder, write_report
 from emberlink.trainers.config.basics import MAX_FIRES
@@ -158,9 +157,7 @@ def evaluate(
         settings |= {} if device is None else {"device": device}
         config = foreign_config(policy, method, chosen, **settings)
         actor = foreign_actor(policy, name or "policy", config)
-    count = config.evaluation.episodes
-    if episodes is not None:
-        count = check_whole("episodes", episodes)
+    count = config.evaluation.episodes if episodes is None else episodes
     if not 1 <= count <= MAX_FIRES:
         raise UserError(f"episodes={count}: expected 1 to {MAX_FIRES}")
     report = progress or (lambda *_: None)

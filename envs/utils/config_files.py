@@ -7,17 +7,16 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Mapping
 from contextlib import suppress
 from functools import lru_cache
 from importlib import metadata
 from importlib.util import find_spec
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 from emberlink import configs
 from emberlink.envs.utils.atomic_io import user_path
-from emberlink.envs.utils.errors import UserError, shown, unknown
+from emberlink.envs.utils.errors import UserError, unknown
 
 VARIABLE = "EMBERLINK_CONFIGS"
 """environment variable with folders of groups, separated as in PATH"""
@@ -91,18 +90,3 @@ def read(group: str, name: str) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise UserError(f"{file}: expected keys and values")
     return values
-
-
-def plain(value: Any) -> Any:
-    """Returns a value with types that JSON has: lists of arrays and ranges, text of paths."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {name: plain(item) for name, item in value.items()}
-    if isinstance(value, list | tuple | range):
-        return [plain(item) for item in value]
-    if isinstance(value, PurePath):
-        return str(value)
-    if not isinstance(value, str | int | float | None):
-        raise UserError(f"{shown(value)}: expected a number, text or list")
-    return value

@@ -8,12 +8,12 @@ are int64 tensors; `fold_in` derives a key from another.
 
 from collections.abc import Sequence
 from enum import IntEnum, unique
+from operator import index
 
 import torch
 from torch import Tensor
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import check_whole
 
 _GOLDEN = -0x61C8864680B583EB  # 0x9E3779B97F4A7C15 as a signed 64-bit integer
 _MIX_A = -0x40A7B892E31B1A47  # 0xBF58476D1CE4E5B9
@@ -82,8 +82,7 @@ def seed_keys(seed: int, count: int, device: torch.device | str | None = None) -
 
 def check_seeds(seed: int | Sequence[int], num_envs: int) -> list[int]:
     """Returns one or several seeds as a list; `num_envs` is a multiple of their number."""
-    given = seed if isinstance(seed, Sequence) and not isinstance(seed, str) else [seed]
-    seeds = [check_whole("seed", number) for number in given]
+    seeds = [index(number) for number in (seed if isinstance(seed, Sequence) else [seed])]
     for number in seeds:
         if not 0 <= number < 2**63:
             raise UserError(f"seed={number}: expected a whole number from 0 to 2^63 - 1")

@@ -1,16 +1,15 @@
 """Validates plain values with pydantic, and describes its first error in one line."""
 
 import json
-import operator
 import re
 import shlex
 from collections.abc import Mapping
-from contextlib import suppress
+from functools import partial
 from typing import Annotated, Any, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic_core import to_json, to_jsonable_python
 
-from emberlink.envs.utils.config_files import plain
 from emberlink.envs.utils.errors import UserError, shown
 
 T = TypeVar("T")
@@ -26,6 +25,10 @@ Name = Annotated[str, Field(pattern=r"^\w[\w.+-]*$", max_length=100)]
 
 CountOrZero = Annotated[int, Field(ge=0)]
 
+_JSON: Any = {"inf_nan_mode": "constants", "fallback": lambda array: array.tolist()}
+plain = partial(to_jsonable_python, **_JSON)
+"""Returns a value with types that JSON has: lists of arrays and ranges, text of paths."""
+
 
 def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -> T:
     """Returns a pydantic dataclass of plain values, such as the content of a YAML file.
@@ -35,13 +38,9 @@ def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -
     """
     # From JSON, strict validation accepts lists as tuples and mappings as dataclasses.
     try:
-        return TypeAdapter(config_type).validate_json(json.dumps(plain(values)))
+        return TypeAdapter(config_type).validate_json(to_json(values, **_JSON))
     except ValidationError as error:
         raise UserError(describe(error, key)) from None
-    except (TypeError, ValueError, RecursionError) as error:
-        if isinstance(error, UserError):
-            raise
-        raise UserError(f"{key or 'the configuration'}: {error}") from None
 
 
 def describe(error: ValidationError, prefix: str = "") -> str:
@@ -67,15 +66,6 @@ def describe(error: ValidationError, prefix: str = "") -> str:
     return f"{key}{value}: {message}"
 
 
-def check_whole(name: str, number: Any) -> int:
-    """Returns a whole number, such as a tensor's or NumPy's, as an int."""
-    with suppress(TypeError):
-        if not isinstance(number, bool):
-            return operator.index(number)
-    given = json.dumps(number) if isinstance(number, str) else number
-    raise UserError(f"{name}={shown(given)}: expected a whole number")
-
-
 def is_index(text: str, end: int) -> bool:
     """Returns whether a text is a whole number from 0 to `end` - 1."""
     return text.isdecimal() and len(text) <= len(str(end)) and int(text) < end
@@ -83,8 +73,7 @@ def is_index(text: str, end: int) -> bool:
 
 def as_argument(key: str, value: str) -> str:
     """Returns `key=value` as it is written in a shell, for a message."""
-    words = ("true", "false", "null", "nan", "inf")  # Hydra reads them as other types
-    if re.fullmatch(r"[^\W\d][\w-]*", value) and value.lower() not in words:
+    if re.fullmatch(r"[^\W\d][\w-]*", value):
         return f"{key}={value}"
     escaped = value.replace('"', '\\"')
     return shlex.quote(f'{key}="{escaped}"')

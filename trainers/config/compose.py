@@ -8,7 +8,7 @@ from pydantic import TypeAdapter
 
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import from_plain, plain, shown
+from emberlink.envs.utils.validation import from_plain, shown
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import GROUPS, change, check_not_removed, composed, flat, put
 
@@ -91,7 +91,6 @@ def differences(
 
 def from_values(values: Mapping[str, Any]) -> RunConfig:
     """Returns a configuration from plain values, such as the content of a config.yaml."""
-    values = {key: value for key, value in values.items() if key != "baselines"}
     for key, value in flat(values).items():
         check_not_removed(key, value)
     return from_plain(RunConfig, values)
@@ -99,4 +98,4 @@ def from_values(values: Mapping[str, Any]) -> RunConfig:
 
 def to_values(config: RunConfig) -> dict[str, Any]:
     """Returns a configuration as plain values, for YAML and trackers."""
-    return plain(TypeAdapter(RunConfig).dump_python(config))
+    return TypeAdapter(RunConfig).dump_python(config, mode="json")

@@ -3,7 +3,6 @@
 Imports no torch, so that a wrong name or key is reported at once.
 """
 
-import difflib
 import json
 import math
 import threading
@@ -25,8 +24,9 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from emberlink.envs.utils import config_files
-from emberlink.envs.utils.config_files import find, plain, read
-from emberlink.envs.utils.errors import UserError, shown
+from emberlink.envs.utils.config_files import find, read
+from emberlink.envs.utils.errors import UserError, shown, unknown
+from emberlink.envs.utils.validation import plain
 
 GROUPS = ("setup", "world", "fire", "learner")
 """groups whose file is chosen by `GROUP=NAME`, besides the method"""
@@ -87,10 +87,7 @@ def change(
     """Sets values by texts `key=value` and by keyword arguments."""
     known = list(all_keys(values))
     given = [parse(text) for text in overrides]
-    for name, value in (settings or {}).items():
-        if name in ("method", *GROUPS):
-            raise UserError(f"{name}={shown(value)}: names a file, so it is not a setting")
-        given.append((full_key(known, name), plain(value)))
+    given += [(full_key(known, name), plain(value)) for name, value in (settings or {}).items()]
     for key, value in given:
         check_not_removed(key, value)
         group, _, last = key.partition(".")
@@ -124,8 +121,6 @@ def parse(text: str) -> tuple[str, Any]:
             f"{shown(text)!r}: only one value is possible here; a list stands in brackets, several "
             "runs are a sweep (emberlink sweep --help)"
         )
-    if parsed.is_delete():
-        raise UserError(f"{shown(text)!r}: a key cannot be removed")
     given = parsed.value()
     # As in the files; Hydra's grammar knows `inf` only.
     return parsed.get_key_element(), math.inf if given == ".inf" else given
@@ -169,15 +164,13 @@ def check_not_removed(key: str, value: Any = None) -> None:
 
 
 def unknown_key(key: str, known: Iterable[str]) -> str:
-    """Returns a message that a key is not known, with similar keys or those beside it."""
+    """Returns a message that a key is not known, with keys of the same end or those beside it."""
     names = list(known)
     parent, _, last = key.rpartition(".")
+    if near := [name for name in names if name.endswith((f".{last}", f"_{last}"))]:
+        return f"key {shown(key)!r} is not known; did you mean {' or '.join(near[:4])}?"
     beside = [name for name in names if name.rpartition(".")[0] == parent * (parent in names)]
-    lasts = {name.rpartition(".")[2]: name for name in beside}
-    near = [name for name in names if name.endswith((f".{last}", f"_{last}"))]
-    near = near or [lasts[name] for name in difflib.get_close_matches(last, lasts, n=1)]
-    hint = f"did you mean {' or '.join(near[:4])}?" if near else f"known: {', '.join(beside)}"
-    return f"key {shown(key)!r} is not known; {hint}"
+    return f"key {unknown(key, beside)}"
 
 
 def all_keys(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

@@ -216,7 +216,7 @@ def test_files_of_the_working_folder_are_not_executed(tmp_path, mark):
         cwd=tmp_path,
         check=False,
     )
-    expected = "emberlink train: key 'env.horizn' is not known; did you mean env.horizon?\n"
-    assert (done.returncode, done.stdout, done.stderr) == (2, "", expected)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert "key 'env.horizn' is not known; did you mean env.horizon?" in done.stderr
     assert not mark.exists()
     assert sorted(tmp_path.rglob("*")) == before
