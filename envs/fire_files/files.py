@@ -8,11 +8,10 @@ import hashlib
 import importlib
 import logging
 import re
-import sqlite3
 import struct
 import warnings
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,8 @@ import numpy as np
 from emberlink.envs.fire_files.report import ask
 from emberlink.envs.utils.errors import UserError, how_to_install
 
-MAX_BYTES = 300_000_000
-"""Bytes of a text file; half as many of GeoJSON, which takes more memory while it is parsed."""
+MAX_BYTES = 150_000_000
+"""Bytes of a text that is parsed whole."""
 _MAX_FILES = 500
 _TEXT = rb"(?:\xef\xbb\xbf)?\s*"  # after a byte order mark
 _HEADS = {
@@ -41,13 +40,9 @@ _HEADS = {
 """First bytes of each format."""
 TABLES = ("shp", "gpkg", "json", "kml", "kmz", "csv", "folder")
 """Formats of perimeters."""
+_GRID = "ForestGrid"  # begins the names of Cell2Fire's maps
 _SUFFIXES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".kmz", ".csv")
-_BESIDE = {
-    "shp": (".shx", ".dbf", ".prj", ".cpg"),
-    "asc": (".prj",),
-    "gpkg": ("-wal", "-journal"),
-    "tif": (".aux.xml", ".msk", ".ovr", ".aux", ".prj", ".tfw", ".tifw", ".tiffw", ".wld", ".tab"),
-}
+_BESIDE = ".shx .dbf .prj .cpg -wal -journal .aux.xml .msk .ovr .aux .tfw .tifw .tiffw .wld .tab"
 """Endings of the files that the libraries open beside one."""
 
 
@@ -81,82 +76,62 @@ def first_line(error: BaseException) -> str:
 def find_format(path: Path) -> str:
     """Returns the format of a file or folder, and checks that it is safe and whole."""
     if path.is_dir():
-        return "grids" if forest_grids(path) else "folder"
+        return "grids" if members(path)[0].name.startswith(_GRID) else "folder"
     kind, head, size = _look(path)
-    if not kind or (kind == "kmz" and path.suffix.lower() != ".kmz"):
-        seen = "an archive" if kind else f"begins with {head[:16]!r}" if head else "is empty"
+    if not kind:
+        seen = f"begins with {head[:16]!r}" if head else "is empty"
         known = "GeoTIFF, NetCDF, ESRI ASCII, .npy, .shp, .gpkg, GeoJSON, KML, KMZ, CSV of points"
         raise ask(seen, f"{known}, the paper's text")
-    if path in forest_grids(path.parent):
-        raise ask("one map of Cell2Fire", "its folder")
-    most = MAX_BYTES // 2 if kind == "json" else MAX_BYTES
-    if kind in ("asc", "csv", "kml", "points", "json") and size > most:
-        raise ask(f"{size} bytes", f"a text file of at most {most}")
-    parts = {part.suffix.lower(): part for part in (path, *beside(path, kind))}
+    if kind in ("csv", "kml", "points", "json") and size > MAX_BYTES:
+        raise ask(f"{size} bytes", f"a text file of at most {MAX_BYTES}")
+    parts = {part.suffix.lower(): part for part in (path, *_beside(path))}
     for suffix, part in parts.items():
+        form, head, size = _look(part)
         # GDAL opens masks and overviews in any format; some formats read other addresses.
-        if _look(part)[0] != "tif" and suffix in (".msk", ".ovr"):
+        if form != "tif" and suffix in (".msk", ".ovr"):
             raise ask(f"{part.name}, beside it, is no TIFF", "one, or no such file")
-    for suffix in (".shp", ".shx", ".dbf") if kind == "shp" else ():
+        if size < (told := _declared(form or suffix, head.ljust(100, b"\0"))):
+            raise ask(f"{part.name} is damaged", f"{told} bytes or more")
+    for suffix in (".shx", ".dbf") if kind == "shp" else ():
         if suffix not in parts:
             raise UserError(f"{path.with_suffix(suffix).name} is missing beside it")
-        _, head, size = _look(parts[suffix])
-        records, start, row = struct.unpack("<IHH", head.ljust(100, b"\0")[4:12])
-        told = 2 * int.from_bytes(head[24:28]) if suffix != ".dbf" else start + records * row
-        if not 0 < told <= size:
-            raise ask(f"{parts[suffix].name} is damaged", f"{told} bytes or more")
-    if kind == "gpkg":  # GDAL reads the rest of a file that was cut off
-        try:
-            uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
-            with closing(sqlite3.connect(uri, uri=True)) as database:
-                result = str(database.execute("PRAGMA integrity_check(1)").fetchone()[0])
-        except sqlite3.Error as error:
-            result = str(error)
-        if result != "ok":
-            raise ask(result[:100], "a whole GeoPackage")
     return kind
 
 
-def beside(path: Path, kind: str) -> list[Path]:
+def _declared(kind: str, head: bytes) -> int:
+    """Returns the bytes that the header of a file declares; GDAL reads what is left of less."""
+    if kind == ".dbf":
+        records, start, row = struct.unpack("<IHH", head[4:12])
+        return start + records * row
+    if kind == "gpkg":
+        return int.from_bytes(head[16:18]) * int.from_bytes(head[28:32])
+    return 2 * int.from_bytes(head[24:28]) if kind == "shp" else 0  # and .shx
+
+
+def _beside(path: Path) -> list[Path]:
     """Returns the files that belong to a file, with its name and an ending, in any case."""
-    endings = _BESIDE.get(kind, ())
-    names = {f"{name}{ending}".lower() for name in (path.stem, path.name) for ending in endings}
+    names = {f"{name}{end}".lower() for name in (path.stem, path.name) for end in _BESIDE.split()}
     return sorted(part for part in path.parent.iterdir() if part.name.lower() in names)
 
 
-def check_prj(path: Path, kind: str, crs: Any) -> None:
-    """Checks that the projection in a .prj beside a file was understood, or given by a key."""
-    for part in beside(path, kind) if crs is None else ():
-        if part.suffix.lower() == ".prj" and part.stat().st_size:
-            seen = f"{part.name}, beside it, holds no projection that is known"
-            raise ask(seen, "fire.crs, such as fire.crs=EPSG:32611")
-
-
-def forest_grids(folder: Path) -> list[Path]:
-    """Returns the maps of Cell2Fire in a folder, in the order of their numbers."""
-    found = [path for path in folder.glob("ForestGrid*.csv") if _look(path)]
-    return sorted(found, key=lambda path: (len(path.name), path.name))
-
-
-def perimeter_files(folder: Path) -> list[Path]:
-    """Returns the perimeters in a folder, sorted by name."""
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+def members(folder: Path) -> list[Path]:
+    """Returns the maps of Cell2Fire in a folder, in the order of their numbers, or perimeters."""
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES]
+    paths = [path for path in paths if path.name.startswith(_GRID)] or paths
     if not 0 < len(paths) <= _MAX_FILES:
         seen = f"a folder with {len(paths)} files of perimeters ({', '.join(_SUFFIXES)})"
         raise ask(seen, f"a file, or a folder of up to {_MAX_FILES} of one fire")
-    return paths
+    return sorted(paths, key=lambda path: (len(path.name), path.name))
 
 
 def digest(path: Path) -> str:
     """Returns the SHA-256 of a file and the files beside it, or of a folder's fires."""
-    content, folder = hashlib.sha256(), path.is_dir()
-    for main in (forest_grids(path) or perimeter_files(path)) if folder else [path]:
-        for part in (main, *beside(main, _look(main)[0])):
-            name = part.name if folder else part.name[len(path.stem) :]
-            content.update(f"{name}:{_look(part)[2]}:".encode())
+    content = hashlib.sha256()
+    for main in members(path) if path.is_dir() else [path]:
+        for part in (main, *_beside(main)):
+            content.update(f"{part.name.removeprefix(path.stem)}:{_look(part)[2]}:".encode())
             with part.open("rb") as file:
-                while block := file.read(1 << 20):
-                    content.update(block)
+                hashlib.file_digest(file, lambda: content)
     return content.hexdigest()
 
 

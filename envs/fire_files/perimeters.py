@@ -15,7 +15,6 @@ from emberlink.envs.fire_files.plane import Bounds, choose_plane
 from emberlink.envs.fire_files.report import Report, ask, counted
 from emberlink.envs.fire_files.tables import choose_features
 from emberlink.envs.fire_files.times import read_times
-from emberlink.envs.utils.errors import UserError
 
 _MAX_TIMES = 500
 _MAX_POINTS = 200_000  # points into which the front of one time is cut
@@ -116,35 +115,31 @@ def read_perimeters(
 ) -> Perimeters:
     """Makes a fire of features, and of the columns whose values stand outside their attributes."""
     (frame, outside), left_out = table, []
-    count = len(frame)
-    frame = frame[~(frame.geometry.isna() | frame.geometry.is_empty)]
-    if len(frame) < count:
-        left_out.append(f"{count - len(frame)} without a geometry left out")
     points = frame.geom_type.isin(("Point", "MultiPoint"))
-    if config.radius is None and points.any():
-        if points.all():
-            key = "fire.radius, metres of the circle around each, such as fire.radius=375 for VIIRS"
-            raise ask(f"{len(frame)} points, as of satellite detections", key)
-        left_out.append(f"{points.sum()} points left out")
-        frame = frame[~points]
-    if len(frame) == 0:
+    if config.radius is None and points.all():
+        key = "fire.radius, metres of the circle around each, such as fire.radius=375 for VIIRS"
+        raise ask(f"{len(frame)} points, as of satellite detections", key)
+    kept = ~(frame.geometry.isna() | frame.geometry.is_empty | (points & (config.radius is None)))
+    if not kept.any():
         raise ask("no feature with a geometry", "perimeters")
-    frame = choose_features(frame, config, left_out)
-    values, clock = read_times(frame, config, outside, report)
-    shapes = _on_plane(frame, config, report)
+    left_out = [f"{(~kept).sum()} without an area left out"] * int(not kept.all())
+    used = choose_features(frame[kept], config, left_out)
+    values, clock = read_times(used, config, outside, report)
+    shapes = _on_plane(used, config, report)
     at, sizes = np.unique(values, return_counts=True)
     first, last = clock.format(at[0]), clock.format(at[-1])
     if not 2 <= len(at) <= _MAX_TIMES:
         seen = f"{report.facts[0]}: {counted(len(at), 'time')}, from {first} to {last}"
         raise ask(seen, f"2 to {_MAX_TIMES}")
-    why = f" ({'; '.join(left_out)})" if left_out else ""
+    why = "; ".join(left_out)
     report.facts = [
         f"perimeters of {len(at)} times, from {first} to {last}",
-        f"{len(frame)} of {count} features used{why}",
+        f"{len(used)} of {len(frame)} features used{why and f' ({why})'}",
         f"{' to '.join(map(str, sorted({sizes.min(), sizes.max()})))} per time",
         *report.facts,
     ]
-    areas, burns = [_areas(shapes[values == time]) for time in at], (float(at[0]), float(at[-1]))
+    areas = [_areas(shapes[values == time]) for time in at]
+    ends = float(at[0]), float(at[-1])
     # A fire with elapsed times began at 0.
     if clock.origin is None and config.units != "day_of_year" and (config.start or 0) != at[0] > 0:
         if config.start is None and at[0] > at[-1] - at[0]:
@@ -153,7 +148,7 @@ def read_perimeters(
                 seen, "fire.start=0 if it began at 0", f"fire.start={at[0]:g} if it began then"
             )
         areas, at = [_at_zero(areas, at), *areas], np.concatenate([[0.0], at])
-    return Perimeters(clock, *burns, float(at[0]), whole=False, areas=areas, at=at)
+    return Perimeters(clock, *ends, float(at[0]), whole=False, areas=areas, at=at)
 
 
 def _at_zero(areas: Sequence[np.ndarray], at: np.ndarray) -> np.ndarray:
@@ -187,34 +182,27 @@ def _on_plane(frame: Any, config: FileFireConfig, report: Report) -> Any:
 def _areas(shapes: Any) -> np.ndarray:
     """Returns the polygons of shapes of one time; a closed line within another is an island.
 
-    Points, and open lines beside a polygon of the same feature, are left out.
+    Points, and open lines beside polygons, are left out.
     """
     shapely, name = library("shapely"), shapes.index[0]
     while shapes.geom_type.isin(("GeometryCollection", "MultiPolygon", "MultiLineString")).any():
         shapes = shapes.explode()
-    areas = shapes[shapes.geom_type == "Polygon"]
+    found = shapes[shapes.geom_type == "Polygon"].to_numpy()
     lines = shapes[shapes.geom_type.isin(("LineString", "LinearRing"))]
-    lines = lines[lines.is_closed | ~lines.index.isin(areas.index)]
-    found = areas.to_numpy()
-    if not areas.is_valid.all():
+    lines = lines[lines.is_closed | (len(found) == 0)].to_numpy()
+    if not shapely.is_valid(found).all():
         found = shapely.make_valid(found, method="structure", keep_collapsed=False)
-    parts = shapely.get_parts(np.concatenate([found, _within(lines)]) if len(lines) else found)
+    if len(lines):
+        merged = shapely.get_parts(shapely.line_merge(shapely.multilinestrings(lines)))
+        ends = shapely.get_point(merged, 0), shapely.get_point(merged, -1)
+        gap = (shapely.distance(*ends) / shapely.length(merged)).max()
+        if gap > _GAP:
+            raise ask(f"{name}: a line is not closed, {gap:.0%} are missing", "closed lines")
+        rings = [shapely.linearrings(shapely.get_coordinates(line)) for line in merged]
+        area = shapely.build_area(shapely.node(shapely.geometrycollections(rings)))
+        found = np.append(found, area)
+    parts = shapely.get_parts(found)
     parts = parts[shapely.area(parts) > 0]
     if len(parts) == 0:
         raise ask(f"{name} encloses no area", "polygons or closed lines")
     return parts
-
-
-def _within(lines: Any) -> np.ndarray:
-    """Returns the area inside closed lines. A line within an odd number of others is an island."""
-    shapely = library("shapely")
-    merged = shapely.get_parts(shapely.line_merge(shapely.multilinestrings(lines.to_numpy())))
-    ends = shapely.get_point(merged, 0), shapely.get_point(merged, -1)
-    gaps, lengths = shapely.distance(*ends), shapely.length(merged)
-    open_ = np.flatnonzero((gaps > _GAP * lengths) | (shapely.get_num_points(merged) < 3))
-    if len(open_):
-        name = lines.index[shapely.distance(lines.to_numpy(), ends[0][open_[0]]).argmin()]
-        gap = f"{gaps[open_[0]]:g} of {lengths[open_[0]]:g}"
-        raise UserError(f"{name}: a line is not closed, {gap} is missing")
-    rings = [shapely.linearrings(shapely.get_coordinates(line)) for line in merged]
-    return np.array([shapely.build_area(shapely.node(shapely.geometrycollections(rings)))])

@@ -1,6 +1,5 @@
 """Reads rasters of arrival times: ESRI ASCII, GeoTIFF, NetCDF, arrays of states, banks, points."""
 
-import itertools
 import math
 import re
 from collections.abc import Iterator
@@ -14,7 +13,7 @@ from scipy.ndimage import binary_erosion, label, map_coordinates, minimum_filter
 
 from emberlink.envs.config import SIDES
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.files import check_prj, first_line, forest_grids, library
+from emberlink.envs.fire_files.files import first_line, library, members
 from emberlink.envs.fire_files.grid import EIGHT, Fire, Window
 from emberlink.envs.fire_files.plane import Bounds, Plane, choose_plane
 from emberlink.envs.fire_files.report import Clock, Report, ask, counted
@@ -34,7 +33,6 @@ _UNITS = {
     "steps": r"steps?|time ?steps?",
     "no unit of time": r"m|ft|feet|foot|met(er|re)s?|deg(ree)?s?|%|percent|.+/.+",
 }
-_HEADER = re.compile(r"\s*(?!nan|inf)[a-z]", re.IGNORECASE)  # a line of ESRI ASCII
 _NORTH_UP = (1.0, 0.0, 0.0, 0.0, -1.0)
 _SIDE = 30  # cells along a side of the paper's map
 _SKIPPED = 6000  # lines of the paper's text before step 0
@@ -126,31 +124,35 @@ def read_raster(
     if kind == "points":
         return [_front_points(path, config, report)]
     if kind in ("npy", "grids"):
-        maps = _array(path, kind)
-        if config.kind == "masks":
-            affine = (*_NORTH_UP, float(maps.shape[1]))
-            return [_of_states(maps, affine, None, config, report)]
-        if kind == "grids":
-            raise ask(f"{len(maps)} maps of Cell2Fire", "fire.kind=masks")
-        json = path.with_suffix(".json")
-        about = json.open(errors="replace").read(1_000_000) if json.is_file() else ""
-        written = re.search(r'"horizon": *(\d+)', about)
-        return _bank(
-            maps.transpose(0, 2, 1)[:, ::-1], written and written[1], config, horizon, report
-        )
-    with _opened(path, kind, config.layer) as dataset:
-        affine, crs, tags = tuple(dataset.transform[:6]), dataset.crs, dataset.tags()
-        if dataset.transform.is_identity:
-            affine = (*_NORTH_UP, float(dataset.height))
-        if config.kind == "masks":
-            return [_of_states(_read(dataset, MAX_BANK), affine, crs, config, report)]
-        if tags.get("units") == "steps" and crs is None:
-            bands = _read(dataset, MAX_BANK)
-            bands = np.where(bands == dataset.nodata, np.inf, bands)
-            return _bank(bands, tags.get("horizon"), config, horizon, report)
-        check_prj(path, kind, crs or config.crs)
-        times, clock, what = _band(path, kind, dataset, config)
-        return [_on_plane(times, affine, crs, clock, what, config, report)]
+        maps, affine, crs = _array(path, kind), None, None
+        if config.kind != "masks":
+            return _bank(path, maps, config, horizon, report)
+        times, clock, what = _of_states(maps, config)
+    else:
+        with _opened(path, kind, config.layer) as dataset:
+            affine, crs = tuple(dataset.transform[:6]), dataset.crs
+            affine = None if dataset.transform.is_identity else affine
+            if config.kind == "masks":
+                times, clock, what = _of_states(_read(dataset, MAX_BANK), config)
+            else:
+                times, clock, what = _band(dataset, kind == "nc", config)
+    north_up = (*_NORTH_UP, float(len(times)))
+    plane = Plane("no place in the file: square cells, the first row in the north")
+    fire = as_fire(times, clock, affine or north_up, plane)
+    if crs is not None or affine not in (None, (*_NORTH_UP, fire.affine[5])):
+        if not 1e-20 < abs(_area(fire.affine)) < 1e12:
+            raise ask(f"cells of {fire.affine[0]:g} x {fire.affine[4]:g}", "a size above 0")
+        fire.plane = choose_plane(crs, config.crs, fire.bounds(None))
+    row, column = np.unravel_index(times.argmin(), times.shape)
+    around = times[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+    crossing = (around[np.isfinite(around)] - fire.first).max()
+    if fire.first <= crossing and clock.origin is None and clock.unit not in ("steps", "maps"):
+        fire.began = 0.0  # the ignition lies between the centres of cells
+    begin, end = clock.format(fire.first), clock.format(fire.last)
+    places = f"{counted(_beginnings(times), 'place')} where it begins"
+    burn = f"{np.isfinite(times).sum()} cells burn from {begin} to {end}"
+    report.facts += [burn, places, what, fire.plane.about]
+    return [fire]
 
 
 @contextmanager
@@ -162,12 +164,13 @@ def _opened(path: Path, kind: str, layer: str | None) -> Iterator[Any]:
         if kind == "nc":
             with rasterio.open(name, driver="netCDF") as dataset:
                 found = [part.rpartition(":")[2] for part in dataset.subdatasets]
-            if found and (layer not in found or '"' in str(path)):
-                key = f"fire.layer={'TIGN_G' if 'TIGN_G' in found else found[0]}"
+            if found and layer not in found:
+                some = "TIGN_G" if "TIGN_G" in found else found[0]
                 seen = f"{len(found)} variables: {', '.join(found[:30])}"
-                raise ask(seen, f"fire.layer, the one of arrival times, such as {key}")
+                raise ask(seen, f"the one of arrival times, such as fire.layer={some}")
             name = f'NETCDF:"{name}":{layer}' if found else name
-        with rasterio.open(name, driver=_DRIVERS[kind]) as dataset:
+        more = {"DATATYPE": "Float64"} if kind == "asc" else {}
+        with rasterio.open(name, driver=_DRIVERS[kind], **more) as dataset:
             yield dataset
     except (rasterio.errors.RasterioError, OSError) as error:
         raise ask(first_line(error), "a whole raster") from None
@@ -183,24 +186,21 @@ def _read(dataset: Any, most: int, band: int | None = None) -> np.ndarray:
     return dataset.read([band] if band else None)
 
 
-def _band(
-    path: Path, kind: str, dataset: Any, config: FileFireConfig
-) -> tuple[np.ndarray, Clock, str]:
-    """Returns the times of a raster's only band, or of the last time of a NetCDF."""
-    band = dataset.count if kind == "nc" else 1
+def _band(dataset: Any, last: bool, config: FileFireConfig) -> tuple[np.ndarray, Clock, str]:
+    """Returns the times of a raster's only band, or of the `last`, with what the band is."""
+    band = dataset.count if last else 1
     if dataset.count != band:
-        some = "a bank of fires, tagged units=steps"
-        raise ask(f"{dataset.count} bands", "one", some, "maps of states with fire.kind=masks")
+        raise ask(f"{dataset.count} bands", "one", "maps of states with fire.kind=masks")
     tags = {name.lower(): text for name, text in (dataset.tags() | dataset.tags(band)).items()}
     titles = dataset.descriptions[band - 1], tags.get("long_name"), tags.get("netcdf_varname")
     declared = (dataset.units[band - 1] or tags.get("units") or tags.get("unit") or "").strip()
     what = f"band {next((title for title in titles if title), band)!r:.60}"
     what += f", the last of {band} times" if band > 1 else ""
     what += f" ({declared})" if declared else ""
-    as_text = kind == "asc"
-    values = _numbers(path, dataset.shape) if as_text else _read(dataset, _MAX_CELLS, band)[0]
-    flags = [flag.name for flag in dataset.mask_flag_enums[band - 1]]
-    nodata = None if "all_valid" in flags else dataset.read_masks(band) == 0
+    values = _read(dataset, _MAX_CELLS, band)[0]
+    nodata = dataset.read_masks(band) == 0
+    if "all_valid" in (flag.name for flag in dataset.mask_flag_enums[band - 1]):
+        nodata[:] = False
     values = values * dataset.scales[band - 1] + dataset.offsets[band - 1]
     name, _, since = declared.partition(" since ")
     known = next((u for u, form in _UNITS.items() if re.fullmatch(form, name, re.IGNORECASE)), None)
@@ -208,25 +208,10 @@ def _band(
         raise ask(f"{what} is in {name[:20]}, {known}", "arrival times")
     unit = decided_unit(known, config, what)
     origin = in_utc(parse_dates([since.strip()], None, "units")[0]) if since else None
-    return _arrival(values, nodata, config), Clock(unit, origin), what
+    return *in_order(_arrival(values, nodata, config), unit, config, origin), what
 
 
-def _numbers(path: Path, shape: tuple[int, ...]) -> np.ndarray:
-    """Returns the numbers of ESRI ASCII; GDAL reads a word as 0, and wraps rows."""
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        rows = itertools.dropwhile(_HEADER.match, file)
-        try:
-            values = np.loadtxt(rows, comments=None, ndmin=2, max_rows=math.prod(shape) + 1)
-        except ValueError as error:
-            raise ask(first_line(error).split(";")[0], f"rows of {shape[1]} numbers") from None
-    if values.shape != shape:
-        raise ask(f"{values.shape} rows and columns", f"nrows, ncols={shape}")
-    return values
-
-
-def _of_states(
-    maps: np.ndarray, affine: Any, crs: Any, config: FileFireConfig, report: Report
-) -> Raster:
+def _of_states(maps: np.ndarray, config: FileFireConfig) -> tuple[np.ndarray, Clock, str]:
     """Returns the number of the first map in which each cell is not unburnt."""
     states = np.unique(maps)
     listed = ", ".join(f"{state:g}" for state in states[:12])
@@ -235,38 +220,16 @@ def _of_states(
         raise ask(f"states {listed}", f"fire.unburned, those that are no fire, {some}")
     burns = ~np.isin(maps, (0,) if config.never is None else config.never)
     times = np.where(burns.any(0), burns.argmax(0), np.inf)
-    _check_spreads(times)
     unit = config.units if config.units not in (None, "steps") else "maps"
     what = f"{len(maps)} maps of the states {listed}, rows from north to south"
-    return _on_plane(times, affine, crs, Clock(unit), what, config, report)
-
-
-def _on_plane(
-    times: np.ndarray, affine: Any, crs: Any, clock: Clock, what: str, config: Any, report: Report
-) -> Raster:
-    """Returns times on the plane of a file's projection, and reports what they are."""
-    if clock.unit in ("days", "day_of_year"):
-        times, clock = in_order(times, config), Clock("days", clock.origin)
-    if not 1e-20 < abs(_area(affine)) < 1e12:
-        raise ask(f"cells of {affine[0]:g} x {affine[4]:g}", "a size above 0")
-    plane = Plane("no place in the file: square cells, the first row in the north")
-    fire = as_fire(times, clock, affine, plane)
-    if crs is not None or affine[:5] != _NORTH_UP:
-        fire.plane = choose_plane(crs, config.crs, fire.bounds(None))
-    row, column = np.unravel_index(times.argmin(), times.shape)
-    around = times[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-    crossing = (around[np.isfinite(around)] - fire.first).max()
-    if fire.first <= crossing and clock.origin is None and clock.unit not in ("steps", "maps"):
-        fire.began = 0.0  # the ignition lies between the centres of cells
-    cells, begin, end = np.isfinite(times).sum(), clock.format(fire.first), clock.format(fire.last)
-    places = f"{counted(_beginnings(times), 'place')} where it begins"
-    report.facts += [f"{cells} cells burn from {begin} to {end}", places, what, fire.plane.about]
-    return fire
+    return *in_order(times, unit, config), what
 
 
 def as_fire(times: np.ndarray, clock: Clock, affine: Any, plane: Plane | None = None) -> Raster:
     """Returns a fire that begins with its first arrival; without a plane, a map of the grid."""
     burning = times[np.isfinite(times)]
+    if len(burning) < 2:
+        raise ask(f"{counted(len(burning), 'cell')} burn", "arrival times of a fire that spreads")
     first, last, whole = float(burning.min()), float(burning.max()), plane is None
     return Raster(
         clock, first, last, first, whole, times.astype(np.float64), affine, plane or Plane("")
@@ -286,7 +249,7 @@ def _array(path: Path, kind: str) -> np.ndarray:
     """Opens an array [fires, X, Y] or [X, Y] of arrival times, or [time, y, x] of states."""
     try:
         if kind == "grids":
-            return np.stack([np.loadtxt(p, delimiter=",", ndmin=2) for p in forest_grids(path)])
+            return np.stack([np.loadtxt(p, delimiter=",", ndmin=2) for p in members(path)])
         # Memory-mapped, so that a wrong header allocates nothing.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # a damaged header raises many types
@@ -299,32 +262,33 @@ def _array(path: Path, kind: str) -> np.ndarray:
 
 
 def _bank(
-    fires: np.ndarray, written: str | None, config: FileFireConfig, horizon: int, report: Report
+    path: Path, fires: np.ndarray, config: FileFireConfig, horizon: int, report: Report
 ) -> list[Raster]:
-    """Returns fires in steps, [fires, rows, columns] from north to south, each a whole map."""
-    count, rows, columns = fires.shape
+    """Returns fires in steps, [fires, X, Y], each a whole map."""
+    count, columns, rows = fires.shape
+    states = np.unique(fires[:: max(1, count // 8)])
+    if len(states) <= 6 and np.isfinite(states).all() and (states % 1 == 0).all():
+        listed = ", ".join(f"{state:g} ({_share(fires, state)})" for state in states)
+        raise ask(f"{count} maps of the states {listed}", "arrival times", "fire.kind=masks")
     if not SIDES[0] <= min(columns, rows) <= max(columns, rows) <= SIDES[1]:
         raise ask(f"fires of {columns} x {rows} cells", f"{SIDES[0]} to {SIDES[1]}")
-    few = np.unique(fires[:: max(1, count // 8)])
-    if len(few) <= 6 and np.isfinite(few).all() and (few % 1 == 0).all():
-        listed = ", ".join(f"{state:g} ({_share(fires, state)})" for state in np.unique(fires))
-        seen = f"{count} maps of the states {listed}, and no inf, never"
-        raise ask(seen, "arrival times of fires", "fire.kind=masks for a map of states per time")
     if config.units not in (None, "steps") and config.test is None:  # no other file has units
         raise ask(f"fire.units={config.units}: a bank is in steps", "none")
-    if config.start is config.end is None and written not in (None, str(horizon)):
-        stretch = f"fire.end={written} to stretch them over {horizon} steps"
-        seen = f"its fires are of {written} steps, env.horizon is {horizon}"
-        raise ask(seen, f"env.horizon={written}", stretch)
+    card = path.with_suffix(".json")
+    about = card.open(errors="replace").read(1_000_000) if card.is_file() else ""
+    written = re.search(r'"horizon": *(\d+)', about)
+    if config.start is config.end is None and written and int(written[1]) != horizon:
+        stretch = f"fire.end={written[1]} to stretch them over {horizon} steps"
+        seen = f"its fires are of {written[1]} steps, env.horizon is {horizon}"
+        raise ask(seen, f"env.horizon={written[1]}", stretch)
     sources = []
     for place, values in enumerate(fires):
         try:
-            times = _arrival(values, None, config, in_bank=True)
+            times = _arrival(values.T[::-1], None, config)
+            sources.append(as_fire(times, Clock("steps"), (*_NORTH_UP, float(rows))))
         except UserError as error:
             raise UserError(f"fire {place}: {error}") from None
-        sources.append(as_fire(times, Clock("steps"), (*_NORTH_UP, float(rows))))
-    about = f"a bank of {counted(count, 'fire')} of {columns} x {rows} cells, in steps"
-    report.facts.append(about + (f", written for {written} steps" if written else ""))
+    report.facts.append(f"a bank of {counted(count, 'fire')} of {columns} x {rows} cells, in steps")
     return sources
 
 
@@ -339,64 +303,44 @@ def _front_points(path: Path, config: FileFireConfig, report: Report) -> Raster:
                 parts = line.strip().removesuffix(b",").split(b",")
                 points = np.array([float(part) for part in parts]).reshape(-1, 3)
             except ValueError:
-                seen = f"line {count}: {line[:20]!r}"
-                raise ask(seen, "x,y,intensity, of points") from None
+                raise ask(f"line {count}: {line[:20]!r}", "x,y,intensity, of points") from None
             cells = np.trunc(points[:, :2] - (_SIDE - 1) / 3).clip(-2, _SIDE + 1).astype(int) + 2
             for i, j in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
                 x, y = (cells + np.array((i, j))).clip(0, _SIDE + 3).T
                 np.minimum.at(times, (x, y), float(count - 1 - _SKIPPED))
     if count <= _SKIPPED:
         raise ask(f"{count} lines", f"more than {_SKIPPED}, which are skipped")
-    times = times[2:-2, 2:-2]
-    _check_spreads(times)
     report.facts.append(f"the paper's text of {count} lines, a line per time")
-    return as_fire(times.T[::-1], Clock(config.units or "steps"), (*_NORTH_UP, float(_SIDE)))
+    clock = Clock(config.units or "steps")
+    return as_fire(times[2:-2, 2:-2].T[::-1], clock, (*_NORTH_UP, float(_SIDE)))
 
 
-def _arrival(
-    values: np.ndarray, nodata: np.ndarray | None, config: FileFireConfig, *, in_bank: bool = False
-) -> np.ndarray:
+def _arrival(values: np.ndarray, nodata: np.ndarray | None, config: FileFireConfig) -> np.ndarray:
     """Returns arrival times, inf in cells that never burn; asks about values that may be no times.
 
-    `nodata` is the file's mask. In a bank, inf says what never burns; all others may burn at once.
+    `nodata` is the file's mask; a bank has none: inf says there what never burns.
     """
-    times = np.array(values, dtype=np.result_type(values, np.float32))
-    if nodata is not None:
-        times[nodata] = np.inf
-    times[np.isin(times, config.never or ())] = np.inf
-    odd = ~(times >= 0) | ((times > _MAX_TIME) & (times < np.inf))
-    found = times[odd]
-    wrong = found[~(np.isnan(found) | (np.abs(found) > _VOID) | np.isin(found, _NEVER))]
-    times[odd] = np.inf
-    plateaus = _plateaus(times, in_bank=in_bank) if config.never is None else []
-    asked = [*np.unique(wrong)[:5].tolist(), *plateaus]
+    times, in_bank = np.array(values, np.result_type(values, np.float32)), nodata is None
+    void = ~(np.abs(times) <= _VOID) | np.isin(times, (*_NEVER, *(config.never or ())))
+    times[void | (False if nodata is None else nodata)] = np.inf
+    told = times if in_bank else times[np.isfinite(times)]
+    wrong = (times < 0) | ((times > _MAX_TIME) & (times < np.inf))
+    asked = np.unique(times[wrong])[:5].tolist()
+    if config.never is None:
+        asked += _plateaus(np.where(wrong, np.inf, times), in_bank=in_bank)
     if asked:
-        told = values[np.isfinite(times) | odd & ~np.isnan(values)] if not in_bank else values
-        listed = " and ".join(f"{v:g} ({_share(told, v)} of the cells)" for v in asked)
+        listed = " and ".join(f"{value:g} ({_share(told, value)} of the cells)" for value in asked)
         some = ",".join(f"{value:g}" for value in asked)
         key = f"'fire.unburned=[{some}]'" if len(asked) > 1 else f"fire.unburned={some}"
         others = times[np.isfinite(times) & ~np.isin(times, asked)]
         between = f"{others.min():g} to {others.max():g}" if len(others) else "none"
         seen = f"{listed} may stand for cells that do not burn (others: {between})"
-        raise ask(seen, key, *([] if len(wrong) else ["fire.unburned=none if they burn then"]))
-    _check_spreads(times, may_stand=in_bank)
+        raise ask(seen, key, *([] if wrong.any() else ["fire.unburned=none if they burn then"]))
     return times
 
 
 def _share(values: np.ndarray, value: float) -> str:
     return f"{100 * (values == value).mean():.0f} %"
-
-
-def _check_spreads(times: np.ndarray, *, may_stand: bool = False) -> None:
-    """Checks that cells burn, more than one and, unless they `may_stand`, one after the other."""
-    burning = times[np.isfinite(times)]
-    seen = ""
-    if len(burning) < 2:
-        seen = "a single cell burns" if len(burning) else "no cell burns: NODATA everywhere"
-    elif burning.min() == burning.max() and not (may_stand and len(burning) < times.size):
-        seen = f"all {len(burning)} cells burn at {burning[0]:g}, at once"
-    if seen:
-        raise ask(seen, "arrival times of a fire that spreads")
 
 
 def _plateaus(times: np.ndarray, *, in_bank: bool) -> list[float]:
@@ -409,8 +353,7 @@ def _plateaus(times: np.ndarray, *, in_bank: bool) -> list[float]:
     values, counts = np.unique(times[finite], return_counts=True)
     cells = times.size if in_bank else counts.sum()
     odd = {int(i) for i in np.flatnonzero(counts > 0.5 * cells)} if len(values) > 1 else set()
-    inner: Any = binary_erosion(finite)
-    edge = times[finite & ~inner]
+    edge = times[finite & ~binary_erosion(finite)]  # pyright: ignore
     for end, rest in ((0, slice(1, None)), (-1, slice(0, -1))):
         others = values[rest]
         if len(others) > 2 and not in_bank:

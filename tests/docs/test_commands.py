@@ -132,7 +132,6 @@ def _render(rest: list[str]) -> list[str]:
 
 SHORT = {
     "world": lambda _: ["env.horizon=5", "--fires", "2"],
-    "fire": lambda rest: ["--count", "2"] * (rest[0] == "make"),
     "train": _train,
     # Executors of clusters may not be installed.
     "sweep": lambda rest: [*(w for w in rest if not w.startswith("executor")), "--dry-run"],

@@ -1,11 +1,10 @@
-"""Defines the arguments of `emberlink fire`: preview, make, import."""
+"""Defines the arguments of `emberlink fire`: preview, import."""
 
 from typing import Any
 
-from emberlink.trainers.cli.parser import command, command_group, path, positive
+from emberlink.trainers.cli.parser import command, command_group, path
 
 _KEYS = "keys of setup, env. and fire., as for train, such as setup=tuned, 'env.grid=[60,60]'"
-_BANK = "a new file that ends in .npy, .tif or .tiff"
 
 
 def add_fire(commands: Any) -> None:
@@ -13,9 +12,8 @@ def add_fire(commands: Any) -> None:
     actions = command_group(
         commands,
         "fire",
-        "preview fires, write them to files, import them",
-        "Draws a fire and tells whether UAVs can keep up with it, writes generated fires "
-        "to files, and imports fires from files.",
+        "preview fires, import them from files",
+        "Draws a fire and tells whether UAVs can keep up with it, and imports fires from files.",
         "emberlink fire preview huygens:3",
     )
     preview = command(
@@ -27,24 +25,10 @@ def add_fire(commands: Any) -> None:
         "the growth of the fire, and whether the setup's UAVs can keep up with it.",
         "emberlink fire preview ArrivalTime.asc fire.units=minutes 'env.grid=[40,40]' setup=tuned",
     )
-    source = "a scenario (huygens, or huygens:3 for its test fire 3), a file (or bank.tif:3), or "
+    source = "a scenario (huygens, or huygens:3 for its test fire 3), a file (or bank.npy:3), or "
     source += "fire=file fire.path=FILE; "
     preview("arguments", metavar="SOURCE | key=value", nargs="+", help=source + _KEYS)
     preview("--output", metavar="PATH", type=path, help="a folder, or a new .png file")
-    make = command(
-        actions,
-        "fire make",
-        "fires.commands:make",
-        "write generated fires to a GeoTIFF or NumPy file",
-        "Generates fires of a scenario and writes their arrival times, in steps, to a new file: a "
-        "GeoTIFF with a band per fire, or NumPy [fires, x, y] with a .json file.",
-        "emberlink fire make huygens --count 64 --split test --output fires.tif 'env.grid=[60,60]'",
-    )
-    make("scenario", metavar="SCENARIO", help="a file in configs/fire")
-    make("overrides", metavar="key=value", nargs="*", help=_KEYS)
-    make("--count", metavar="N", type=positive, help="number of fires")
-    make("--split", choices=("train", "validation", "test"), default="train")
-    make("--output", metavar="FILE", type=path, help=_BANK)
     imported = command(
         actions,
         "fire import",
@@ -56,4 +40,4 @@ def add_fire(commands: Any) -> None:
     )
     files = "files with one fire or more; " + _KEYS
     imported("arguments", metavar="FILE | key=value", nargs="+", help=files)
-    imported("--output", metavar="BANK", type=path, required=True, help=_BANK)
+    imported("--output", metavar="BANK", type=path, required=True, help="a new file, .npy")

@@ -86,7 +86,6 @@ def test_no_regular_files_and_no_addresses(tmp_path, wholes):
     os.mkfifo(tmp_path / "pipe.tif")
     (tmp_path / "loop.shp").symlink_to(tmp_path / "loop.shp")
     (tmp_path / "empty").mkdir()
-    shutil.copy(wholes[".kmz"], tmp_path / "fire.zip")
     with (tmp_path / "large.geojson").open("wb") as file:
         file.write(b"{")
         file.truncate(150_000_001)  # a hole, which takes no space
@@ -96,7 +95,6 @@ def test_no_regular_files_and_no_addresses(tmp_path, wholes):
         "none.gpkg": "no such file",
         "x" * 300: "cannot be read",
         "empty": "a folder with 0 files of perimeters",
-        "fire.zip": "an archive",
         "large.geojson": "150000001 bytes; .* at most 150000000",
     }.items():
         refused(tmp_path / name, match)
@@ -125,14 +123,13 @@ def test_links_declarations_and_sizes_in_texts_are_refused(tmp_path, wholes):
     kml = wholes[".kml"].read_text().partition("?>")[2]
     rows = wholes[".asc"].read_text()
     for name, text, match in (
-        ("fire.asc", rows.strip() + " 7", "row"),
         ("fire.asc", rows.replace("NCOLS 40", "NCOLS 1000000000"), "40 x 1000000000|expected"),
         ("fire.json", json.dumps({**whole, "crs": link}), "crs is a link, which is not followed"),
         ("fire.json", '{"a":' * 100_000, "levels|recursion|expected"),
         ("fire.json", json.dumps({**whole, "crs": None, "type": "Topology"}), "'Topology'"),
         ("fire.json", json.dumps({**whole, "crs": None, "features": [1]}), "expected"),
         ("fire.kml", f'<!DOCTYPE kml [<!ENTITY a "aaaa">]>{kml}', "document type declaration"),
-        ("fire.kml", "<html></html>", "'html'; expected KML"),
+        ("fire.kml", "<html></html>", "no placemark"),
     ):
         (tmp_path / name).write_text(text)
         refused(tmp_path / name, match)
@@ -153,9 +150,9 @@ def test_values_that_are_no_times(tmp_path):
     one = np.full_like(times, -9999.0)
     one[20, 20] = 5.0
     for values, match in (
-        (np.full_like(times, np.nan), "no cell burns"),
-        (one, "a single cell burns"),
-        (np.where(times >= 0, 3.0, times), "at once"),
+        (np.full_like(times, np.nan), "0 cells burn"),
+        (one, "1 cell burn"),
+        (np.where(times >= 0, 3.0, times), "no fire spreads"),
         (np.where(one == 5, -0.5, times), r"-0.5 \(1 % .*fire.unburned=-0.5"),
         (np.where(times < 0, -32768.0, times), "fire.unburned=-32768"),
         (times.astype("complex64"), "real numbers"),

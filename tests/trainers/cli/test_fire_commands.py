@@ -6,17 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 import refusal
 from burning import burning_cells
 from fire_files import write_asc
 from PIL import Image
 
-from emberlink.envs.fire.cache import GENERATOR_VERSION
 from emberlink.envs.fire.generator import fire_seeds, load_scenario, make_fires
 from emberlink.trainers.cli import main
 from emberlink.trainers.fires import plot
-from emberlink.trainers.fires.bank_writer import write_bank
 
 pytestmark = pytest.mark.drawn
 
@@ -103,68 +100,28 @@ def test_preview_draws_its_numbers(capsys):
     assert cell < area(name, (255, 255, 0)) < 3 * cell
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".tif", ".tiff"])
-def test_make_writes_the_scenarios_fires(suffix, capsys, tmp_path):
-    file = tmp_path / f"bank{suffix}"
-    lines = ran(
-        capsys,
-        *("make", "--count", 5, "huygens", "--split", "test", "env.grid=[20,34]"),
-        *("env.horizon=300", "fire.head_ros=[0.01,0.02]", "--output", file),
-    )
-    assert lines == ["5 fires of 20 x 34 cells, 300 steps", str(file)]
-    config = load_scenario("huygens")
-    object.__setattr__(config, "head_ros", (0.01, 0.02))
-    expected = make_fires(config, fire_seeds("test", 5), (20, 34), 300).numpy()
-    assert np.isinf(expected).any()
-    if suffix == ".npy":
-        fires, about = np.load(file), json.loads(file.with_suffix(".json").read_text())
-        names, rate = about["fires"], about["fire"]["head_ros"]
-        assert about["axes"] == ["fire", "x", "y"]
-    else:
-        with rasterio.open(file) as raster:
-            rows, about, names = raster.read(), raster.tags(), list(raster.descriptions)
-            assert (raster.nodata, raster.crs) == (-9999, None)
-            assert raster.xy(0, 0) == (0, 33)  # a cell's centre has its (i, j) as coordinates
-        fires = np.where(rows == -9999, np.inf, rows)[:, ::-1].transpose(0, 2, 1)
-        rate = json.loads(about["fire"])["head_ros"]
-    assert fires.dtype == np.float32
-    assert np.array_equal(fires, expected)
-    assert names == [f"huygens test {seed}" for seed in range(1_000_000, 1_000_005)]
-    assert rate == [0.01, 0.02]
-    told = " ".join(str(about[key]) for key in ("units", "scenario", "split", "horizon", "seeds"))
-    assert told == "steps huygens test 300 1000000 to 1000004"
-    assert int(about["generator_version"]) == GENERATOR_VERSION
-    assert about["emberlink_version"]
-    keys = ("env.grid=[20,34]", "env.horizon=300")
-    ran(capsys, "import", file, *keys, "--output", tmp_path / "again.npy")
-    assert np.array_equal(np.load(tmp_path / "again.npy"), expected)
-
-
 def test_import_of_several_files(capsys, tmp_path):
     first = asc(tmp_path / "one.asc", disc())
     second = asc(tmp_path / "a=b.asc", disc(30, 0.03, (12, 12)))
     keys = ("fire.units=minutes", "env.grid=[25,20]", "env.horizon=200")
-    lines = ran(capsys, "import", first, *keys, second, "--output", "both.tif")
+    lines = ran(capsys, "import", first, *keys, second, "--output", "both.npy")
     assert [line.partition(": read: ")[0] for line in lines[:2]] == ["one.asc", "a=b.asc"]
-    assert lines[2:] == ["2 fires of 25 x 20 cells, 200 steps", "both.tif"]
-    for name, file in (("first.npy", first), ("second.npy", second)):
+    assert lines[2:] == ["2 fires of 25 x 20 cells, 200 steps", "both.npy"]
+    both, facts = np.load("both.npy"), json.loads(Path("both.json").read_text())
+    for fire, name, file in zip(both, ("first.npy", "second.npy"), (first, second), strict=True):
         ran(capsys, "import", file, *keys, "--output", name)
-    with rasterio.open("both.tif") as raster:
-        both, tags, names = raster.read(), raster.tags(), raster.descriptions
-    for rows, name in zip(both, ("first.npy", "second.npy"), strict=True):
-        fire = np.load(name)[0]
+        assert np.array_equal(np.load(name)[0], fire)
         assert fire.min() == 0
         assert 190 < fire[np.isfinite(fire)].max() <= 200
-        assert np.array_equal(np.where(rows == -9999, np.inf, rows)[::-1].T, fire)
-    assert names == ("one.asc", "a=b.asc")
-    assert [source["file"] for source in json.loads(tags["sources"])] == ["one.asc", "a=b.asc"]
-    assert tags["units"] == "steps"
-    lines = ran(capsys, "preview", "both.tif:1", *keys[1:])
+    assert [source["file"] for source in facts["sources"]] == ["one.asc", "a=b.asc"]
+    ran(capsys, "import", "both.npy", *keys[1:], "--output", "again.npy")
+    assert np.array_equal(np.load("again.npy"), both)
+    lines = ran(capsys, "preview", "both.npy:1", *keys[1:])
     assert lines[1].startswith("read: a bank of 2 fires of 25 x 20 cells")
-    assert lines[0] == "both.tif, fire 1 of 2: 25 x 20 cells, 200 steps, setup paper"
-    assert numbers(lines)["burning at the end"] == np.isfinite(np.load("second.npy")).sum()
+    assert lines[0] == "both.npy, fire 1 of 2: 25 x 20 cells, 200 steps, setup paper"
+    assert numbers(lines)["burning at the end"] == np.isfinite(both[1]).sum()
     assert lines[-1] == "fire_both_1.png"
-    with pytest.warns(UserWarning, match="without the times at which cells burn out"):
+    with pytest.warns(UserWarning, match="fire.burn_time is not written"):
         ran(capsys, "import", first, *keys, "fire.burn_time=50", "--output", "burnt.npy")
 
 
@@ -172,13 +129,13 @@ def test_import_of_several_files(capsys, tmp_path):
     ("arguments", "words"),
     [
         (["preview", "huygns"], ["huygns", "did you mean huygens?", "known: front, huygens"]),
-        (["preview", "bank.npy:2"], ["bank.npy:2", "no fire '2'", "0 to 1"]),
+        (["preview", "bank.npy:2"], ["bank.npy", "no fire '2'", "0 to 1"]),
         (["preview", "folder"], ["folder", "expected a file"]),
         (["preview", "paper", "fire.units=minutes"], ["fire.units"]),
         (["preview", "paper", "--output", "there.png"], ["there.png exists already"]),
-        (["make", "paper", "--count", "5000", "--output", "a.tif"], ["5000 fires", ".npy"]),
-        (["make", "paper", "--output", "bank.npy"], ["bank.npy exists already"]),
-        (["make", "paper", "--output", "beside.npy"], ["beside.json exists already"]),
+        (["import", "300.npy", "--output", "a.tif"], ["a.tif", "must end in .npy"]),
+        (["import", "300.npy", "--output", "bank.npy"], ["bank.npy exists already"]),
+        (["import", "300.npy", "--output", "beside.npy"], ["beside.json exists already"]),
         (["import", "none.asc", "--output", "a.npy"], ["none.asc", "no such file"]),
         (["import", "300.npy", "env.horizon=9", "--output", "a.npy"], ["300", "fire.end=300"]),
     ],
@@ -188,8 +145,9 @@ def test_errors_are_one_line_and_leave_no_files(arguments, words, capsys, tmp_pa
     (tmp_path / "there.png").write_text("mine")
     (tmp_path / "beside.json").write_text("mine")
     fires = make_fires(HUYGENS, fire_seeds("train", 2), (30, 30), 300)
-    write_bank(tmp_path / "bank.npy", fires)
-    write_bank(tmp_path / "300.npy", fires, facts={"horizon": 300})
+    np.save(tmp_path / "bank.npy", fires.numpy())
+    np.save(tmp_path / "300.npy", fires.numpy())
+    (tmp_path / "300.json").write_text('{"horizon": 300}')
     before = {path.name: path.is_file() and path.read_bytes() for path in tmp_path.iterdir()}
     err = refused(capsys, *arguments)
     assert len(err) < 400
@@ -214,15 +172,13 @@ def test_preview_takes_the_keys_of_train(capsys, tmp_path):
 
 @pytest.mark.slow
 def test_a_full_disk_gives_one_line_and_leaves_no_files(capsys, tmp_path):
-    making, before = ["make", "huygens", "--count", 30], resource.getrlimit(resource.RLIMIT_FSIZE)
-    for arguments in (
-        [*making, "--output", "a.npy"],
-        [*making, "--output", "a.tif"],
-        ["preview", "huygens"],
-    ):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    asc(tmp_path / "fire.asc", disc())
+    importing = ["import", "fire.asc", "fire.units=minutes", "--output", "a.npy"]
+    for arguments in (importing, ["preview", "huygens"]):
         resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
         try:
             assert "File too large" in refused(capsys, *arguments)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        assert list(tmp_path.iterdir()) == []
+        assert [path.name for path in tmp_path.iterdir()] == ["fire.asc"]
