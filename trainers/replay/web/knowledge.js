@@ -10,7 +10,7 @@ function eachInView(panel, rows, step, uav, visit) {
   for (let x = left; x <= right; x++) {
     for (let y = low; y <= high; y++) {
       const place = (uav * panel.side + x - left) * panel.side + y - low;
-      if (!panel.missed?.(step, 0, place)) visit(x * rows + y);
+      if (!panel.missed?.(step, place)) visit(x * rows + y);
     }
   }
 }
@@ -138,7 +138,7 @@ function reachable(panel, step) {
     while (waiting.length) {
       const taker = waiting.pop();
       for (let source = 0; source < radios; source++) {
-        if (!reach[radio * radios + source] && panel.hears(step, taker, source)) {
+        if (!reach[radio * radios + source] && panel.hears(step, taker * radios + source)) {
           reach[radio * radios + source] = 1;
           waiting.push(source);
         }

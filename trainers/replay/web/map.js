@@ -189,8 +189,9 @@ export class MapView {
     const many = panel.uavs > MANY;
     for (let taker = 0; taker < panel.radios; taker++) {
       for (let source = 0; source < panel.radios; source++) {
-        const heard = panel.hears(this.step, taker, source);
-        const lost = this.options.lost && panel.lost?.(this.step, taker, source);
+        const link = taker * panel.radios + source;
+        const heard = panel.hears(this.step, link);
+        const lost = this.options.lost && panel.lost?.(this.step, link);
         if (!heard && !lost) continue;
         const [from, to] = [this.radio(taker), this.radio(source)];
         const middle = from.map((value, axis) => (value + to[axis]) / 2);

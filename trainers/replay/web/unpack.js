@@ -1,83 +1,22 @@
 // Reads the data of the page, which replay/page.py wrote.
 
-const TYPES = {
-  u1: Uint8Array, i1: Int8Array, u2: Uint16Array, i2: Int16Array,
-  u4: Uint32Array, i4: Int32Array, f4: Float32Array,
-};
-const VERSION = 1;
-const BITS = ["hears", "lost", "missed"]; // a bit per step
-const NEEDED = ["position", "view", "hears", "reward", "seen", "burning", "burnt"];
-
 /** Returns the episodes that a text in base64 holds; throws an error if it is damaged. */
 export async function unpack(text) {
-  const buffer = await decompress(decoded(text));
-  const length = new DataView(buffer).getUint32(0, true);
-  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
-  if (header.version !== VERSION) throw new Error(`unknown version ${header.version}`);
-  const [columns, rows] = header.grid;
-  if (!header.panels.length) throw new Error("no episode");
-  const read = (entry) => array(buffer, 4 + length, entry);
-  return {
-    ...header, columns, rows,
-    ignition: read(header.ignition).values,
-    end: read(header.end).values,
-    panels: header.panels.map((panel) => unpackPanel(panel, read, header.horizon)),
-  };
-}
-
-/** Returns the bytes of a text in base64. */
-function decoded(text) {
-  try {
-    return Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
-  } catch {
-    throw new Error("not in base64");
-  }
-}
-
-/** Returns the content of bytes compressed with gzip. */
-async function decompress(packed) {
+  const packed = Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
   const plain = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
-  try {
-    return await new Response(plain).arrayBuffer();
-  } catch {
-    throw new Error("not whole, or not compressed with gzip");
-  }
+  const data = await new Response(plain).json();
+  const [columns, rows] = data.grid;
+  return { ...data, columns, rows, panels: data.panels.map((panel) => unpackPanel(panel, data.horizon)) };
 }
 
-/** Returns a panel with its arrays in place of their descriptions. */
-function unpackPanel(panel, read, horizon) {
-  const radios = panel.uavs + (panel.base ? 1 : 0);
-  const unpacked = { ...panel, radios, horizon };
-  for (const [name, entry] of Object.entries(panel)) {
-    if (!entry?.type) continue;
-    const { values, width } = read(entry);
-    const steps = BITS.includes(name) ? width * 8 : width;
-    if (steps < horizon + 1) throw new Error(`${name} has ${steps} steps of ${horizon + 1}`);
-    if (BITS.includes(name)) {
-      unpacked[name] = (step, taker, source) =>
-        (values[(taker * radios + source) * width + (step >> 3)] >> (step & 7)) & 1;
-    } else {
-      // Row by row: what it is of, such as x of UAV 0, then the steps.
-      unpacked[name] = (step, row = 0) => values[row * width + step];
-    }
-  }
-  for (const name of NEEDED) {
-    if (typeof unpacked[name] !== "function") throw new Error(`${name} is missing`);
+/** Returns a panel with functions (step, row) in place of its rows of numbers. */
+function unpackPanel({ steps, ...panel }, horizon) {
+  const unpacked = { ...panel, radios: panel.uavs + (panel.base ? 1 : 0), horizon };
+  for (const [name, rows] of Object.entries(steps)) {
+    // A row is of one number, such as x of UAV 0: a list, or a text of 0 and 1.
+    unpacked[name] = (step, row = 0) => Number(rows[row][step]);
   }
   return unpacked;
-}
-
-/** Returns the values of an array and the length of its last axis. */
-function array(buffer, start, { type, shape, at, delta }) {
-  const length = shape.reduce((product, side) => product * side, 1);
-  const width = shape[shape.length - 1];
-  const values = new TYPES[type](buffer, start + at, length);
-  if (delta) {
-    for (let index = 0; index < length; index++) {
-      if (index % width) values[index] += values[index - 1];
-    }
-  }
-  return { values, width };
 }
 
 /** Formats a number with digits after the point, halves to even, as Python does. */
