@@ -12,7 +12,6 @@ from torchrl.envs import EnvBase
 
 from emberlink.envs import keys, metrics
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.rendering import frame
 from emberlink.envs.scenarios import ScenarioConfig, default_config, load_fires
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
@@ -468,8 +467,10 @@ class WildfireEnv(EnvBase):
         """
         if mode != "rgb_array":
             raise UserError(f"render mode {mode!r} is not known; known: 'rgb_array'")
+        from emberlink.envs.rendering.frame import frame  # imports matplotlib
+
         flies = self._alive(self._time)
-        return frame.frame(
+        return frame(
             self.fire_map[env].cpu().numpy(),
             self._position[env].cpu().numpy(),
             view_angle=self.config.view_angle,

@@ -8,10 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from emberlink.envs.rendering.frame import frame
 from emberlink.trainers.evaluation.scores import CURVES, LEARNED, Results
 from emberlink.trainers.replay.recording import Recording
-from emberlink.trainers.replay.screen import even_steps
+from emberlink.trainers.replay.screen import draw_step, even_steps
 
 
 def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) -> None:
@@ -65,14 +64,6 @@ def timelapse(path: Path, episode: Recording) -> None:
     steps = even_steps(episode.horizon, 5)
     figure = Figure(figsize=(2.4 * len(steps), 2.7), layout="constrained")
     for axes, step in zip(figure.subplots(1, len(steps), squeeze=False)[0], steps, strict=True):
-        picture = frame(
-            episode.fire_map(step),
-            episode.steps["position"][step],
-            view_angle=episode.world.view_angle,
-            alive=episode.steps["alive"][step],
-            base=episode.world.base,
-        )
-        axes.imshow(picture, interpolation="nearest")
+        draw_step(axes, episode, step)
         axes.set_title(f"step {step}", fontsize="medium")
-        axes.set_axis_off()
     figure.savefig(path, format="png", dpi=120)

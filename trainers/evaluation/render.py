@@ -43,8 +43,7 @@ def render(options: argparse.Namespace, console: Console) -> int:
             if path.suffix == ".html":
                 Replay(played, name).save(partial)
             elif path.suffix == ".png":
-                image = Image.fromarray(screen.picture(steps[0])).quantize(256)
-                image.save(partial, "PNG", optimize=True)
+                Image.fromarray(screen.picture(steps[0])).save(partial, "PNG", optimize=True)
             else:
                 write = write_gif if path.suffix == ".gif" else write_mp4
                 write(partial, map(screen.picture, steps), fps=options.fps)

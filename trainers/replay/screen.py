@@ -1,41 +1,39 @@
 """Draws episodes side by side: a map with marks and a title for each, and a legend."""
 
 import math
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+import textwrap
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
 
 from emberlink.envs.rendering import frame
-from emberlink.envs.rendering.frame import Chart, Colour, Pen
+from emberlink.envs.rendering.frame import DPI, mark
 from emberlink.trainers.replay.recording import ROLES, Episode, Recording
 
-SEEN_FIRE = (140, 140, 140)
+SEEN_FIRE = "#8c8c8c"
 """colour of seen fire where seen and unseen fire differ (paper, figure 2)"""
-LINK = (0, 200, 255)
-LINK_WIDTHS = {frame.NO_FIRE: 4, LINK: 2}
-"""width in pixels of each line of a link; the dark edge is drawn first"""
-TARGET = (255, 140, 0)
-ROLE_COLOURS = ((230, 0, 60), (0, 150, 60), (215, 215, 215))
+LINK = "#00c8ff"
+NO_ROLE = "#ff8c00"
+"""colour of the targets of UAVs without a role"""
+ROLE_MARKS: tuple[dict[str, Any], ...] = (
+    {"color": "#e6003c", "marker": "D", "ms": 11, "mec": frame.NO_FIRE},
+    {"color": "#00963c", "marker": "^", "ms": 15, "mec": frame.NO_FIRE},
+    {"color": "#d7d7d7", "marker": "s", "ms": 12, "mec": frame.NO_FIRE},
+)
+"""mark behind a UAV in each of `ROLES`"""
+TARGET: dict[str, Any] = {"marker": "x", "ms": 6, "mew": 1.5}
 MANY = 16
 """number of UAVs above which links are thin and lines to targets are left out"""
-_PAPER, _INK = (40, 40, 44), (240, 240, 240)
-_GAP, _LINE = 10, 20
-_HEADER = 2 * _LINE + 4
+_PAPER, _INK = "#28282c", "#f0f0f0"
 _NARROWEST = 250  # minimum width of a panel in pixels, for its title
-_TEXT = 15
-_SAMPLE = 30  # width of the sample before the text of a legend entry
-
-# Corners of the shape of each role: offsets to the right and downwards, in half widths.
-_SHAPES = (
-    ((0, -1.3), (1.3, 0), (0, 1.3), (-1.3, 0)),
-    ((0, -1.4), (1.35, 1), (-1.35, 1)),
-    ((-1, -1), (1, -1), (1, 1), (-1, 1)),
-)
-
-Sample = Callable[[Pen, float, float], None]
+_LINE, _LETTER, _ENTRY = 18, 7.5, 160  # height of a line, widths of a letter and a legend entry
 
 
 class Screen:
@@ -46,131 +44,93 @@ class Screen:
 
     def __init__(self, episodes: Sequence[Episode], *, size: int, grey_seen: bool = False):
         self._episodes, self._grey_seen = episodes, grey_seen
-        grid = episodes[0].recording.world.grid
-        self.scale = scale_of(grid, size)
-        self.map_size = grid[0] * self.scale, grid[1] * self.scale
-        self._font = ImageFont.load_default(_TEXT)
-        panel = max(self.map_size[0], _NARROWEST) + _GAP, self.map_size[1] + _HEADER + _GAP
-        columns = _columns(len(episodes), *panel)
-        rows = math.ceil(len(episodes) / columns)
-        self._corners = [
-            (_GAP + i % columns * panel[0], _GAP + i // columns * panel[1])
-            for i in range(len(episodes))
-        ]
-        width, top, legend = columns * panel[0] + _GAP, rows * panel[1] + _GAP, self.legend()
-        places, used = self._wrap([*legend], width)
-        height = top + used + _GAP
-        # Videos need even sides.
-        self._blank = Image.new("RGB", (width + width % 2, height + height % 2), _PAPER)
-        pen = ImageDraw.Draw(self._blank)
-        for (x, y), (word, sample) in zip(places, legend.items(), strict=True):
-            sample(pen, x + 10, top + y + _LINE / 2)
-            self._write(pen, x + _SAMPLE, top + y, word)
-        for (x, y), episode in zip(self._corners, episodes, strict=True):
-            self._write(pen, x, y, self._shortened(episode.title, panel[0] - _GAP))
-
-    def map_corner(self, panel: int) -> tuple[int, int]:
-        """Returns the upper left pixel of a panel's map, (x, y)."""
-        x, y = self._corners[panel]
-        return x, y + _HEADER
+        grid, count = episodes[0].recording.world.grid, len(episodes)
+        width, height = (size * side / max(grid) for side in grid)
+        width = max(width, _NARROWEST)
+        columns = min(count, math.ceil(math.sqrt(count * height / width)))
+        titles = [textwrap.fill(one.title, int(width / _LETTER)) for one in episodes]
+        self._titles = [f"{title}\nstep {{}}   coverage {{:.1f}} %" for title in titles]
+        height += _LINE * (2 + max(title.count("\n") for title in self._titles))
+        rows = math.ceil(count / columns)
+        legend, per_line = self.legend(), max(1, int(columns * width / _ENTRY))
+        total = columns * width, rows * height + _LINE * (1 + math.ceil(len(legend) / per_line))
+        inches: Any = [2 * round(pixels / 2) / DPI for pixels in total]  # even, as videos need
+        self.figure = Figure(figsize=inches, dpi=DPI, layout="constrained", facecolor=_PAPER)
+        self.axes: list[Axes] = list(self.figure.subplots(rows, columns, squeeze=False).flat)
+        place = {"loc": "outside lower left", "ncols": per_line, "frameon": False}
+        self.figure.legend(handles=legend, labelcolor=_INK, fontsize="small", **place)
+        self._canvas = FigureCanvasAgg(self.figure)
+        self._blank: Any = None
+        self.picture(0)
+        self._canvas.draw()  # finds the layout, which stays
+        self.figure.set_layout_engine("none")
+        for axes in self.axes:
+            axes.set_visible(False)
+        self._canvas.draw()  # the legend, once for all pictures
+        self._blank = self._canvas.copy_from_bbox(self.figure.bbox)
 
     def picture(self, step: int) -> NDArray[np.uint8]:
         """Draws a step of all episodes, uint8 [height, width, 3], both sides even."""
-        image = self._blank.copy()
-        pen = ImageDraw.Draw(image)
+        if self._blank is not None:
+            self._canvas.restore_region(self._blank)
         seen = SEEN_FIRE if self._grey_seen else frame.FIRE
-        for panel, episode in enumerate(self._episodes):
-            drawn = draw_map(episode.recording, step, scale=self.scale, seen_fire=seen)
-            image.paste(drawn, self.map_corner(panel))
-            x, y = self._corners[panel]
-            covered = f"step {step}   coverage {episode.recording.coverage(step):.1f} %"
-            self._write(pen, x, y + _LINE, covered)
-        return np.asarray(image)
+        for axes, title, episode in zip(self.axes, self._titles, self._episodes, strict=False):
+            for earlier in (*axes.images, *axes.collections, *axes.lines):
+                earlier.remove()
+            axes.set_visible(True)
+            draw_step(axes, episode.recording, step, seen_fire=seen)
+            text = title.format(step, episode.recording.coverage(step))
+            axes.set_title(text, loc="left", color=_INK, fontsize=10, parse_math=False)
+            axes.draw_artist(axes)
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _write(self, pen: Pen, x: float, y: float, text: str) -> None:
-        pen.text((x, y + _LINE / 2), text, fill=_INK, font=self._font, anchor="lm")
-
-    def _shortened(self, text: str, width: float) -> str:
-        """Cuts the middle of a text to fit a width; its end often names how panels differ."""
-        kept, cut = len(text), text
-        while kept and self._font.getlength(cut) > width:
-            kept -= 1
-            cut = f"{text[: -(-kept // 2)]}…{text[len(text) - kept // 2 :]}"
-        return cut
-
-    def _wrap(self, words: Sequence[str], most: int) -> tuple[list[tuple[float, float]], int]:
-        """Returns the position of each legend entry, and the height of the legend."""
-        places: list[tuple[float, float]] = []
-        x, y = _GAP, 0
-        for word in words:
-            width = _SAMPLE + math.ceil(self._font.getlength(word)) + 2 * _GAP
-            if x > _GAP and x + width > most + _GAP:
-                x, y = _GAP, y + _LINE
-            places.append((x, y))
-            x += width
-        return places, y + _LINE
-
-    def legend(self) -> dict[str, Sample]:
-        """Returns the text and a sample of each legend entry, for the marks that occur."""
+    def legend(self) -> list[Line2D]:
+        """Returns a sample with a label for each mark that occurs."""
         shown = [episode.recording for episode in self._episodes]
-        roles = ["follows" in one.steps for one in shown]
-        half = _mark_size(self.scale)
-        target = ROLE_COLOURS[0] if any(roles) else TARGET
         last = [one.fire_map(one.horizon) for one in shown]
-        occurs: list[tuple[bool, str, Sample]] = [
-            (True, "fire", _box(frame.FIRE)),
-            (self._grey_seen, "fire, seen", _box(SEEN_FIRE)),
-            (True, "field of view", _box(frame.FIELD_OF_VIEW)),
-            (not all(roles), "UAV", _uav_sample(half, None)),
-            *((any(roles), name, _uav_sample(half, role)) for role, name in enumerate(ROLES)),
-            (any(one.listens for one in shown), "hear each other", _link_sample),
-            (any("target" in one.steps for one in shown), "target", _target_sample(target)),
-            (any(one.world.base for one in shown), "base", _base_sample),
-            (any(not one.steps["alive"].all() for one in shown), "failed", _failed_sample),
-            (any((fire == 3).any() for fire in last), "burnt out, seen", _box(frame.BURNT_OUT)),
-            (any((fire == 4).any() for fire in last), "burnt out, not seen", _box(frame.MISSED)),
+        roles = ["follows" in one.steps for one in shown]
+        target = ROLE_MARKS[0]["color"] if any(roles) else NO_ROLE
+        occurs: list[tuple[bool, str, dict[str, Any]]] = [
+            (True, "fire", _cell(frame.FIRE)),
+            (self._grey_seen, "fire, seen", _cell(SEEN_FIRE)),
+            (True, "field of view", _cell(frame.FIELD_OF_VIEW)),
+            (True, "UAV", frame.UAV),
+            *((any(roles), name, style) for name, style in zip(ROLES, ROLE_MARKS, strict=True)),
+            (any(one.listens for one in shown), "hear each other", {"color": LINK, "ls": "-"}),
+            (any("target" in one.steps for one in shown), "target", {**TARGET, "color": target}),
+            (any(one.world.base for one in shown), "base", frame.BASE),
+            (any(not one.steps["alive"].all() for one in shown), "failed", frame.FAILED),
+            (any((fire == 3).any() for fire in last), "burnt out, seen", _cell(frame.BURNT_OUT)),
+            (any((fire == 4).any() for fire in last), "burnt out, not seen", _cell(frame.MISSED)),
         ]
-        return {word: sample for shown, word, sample in occurs if shown}
+        return [Line2D([], [], label=n, **{"ls": "", **s}) for shown, n, s in occurs if shown]
 
 
-def draw_map(
-    episode: Recording, step: int, *, scale: int, seen_fire: Colour = frame.FIRE
-) -> Image.Image:
-    """Returns the map of an episode at a step with links, targets, and UAVs in their roles."""
+def draw_step(axes: Axes, episode: Recording, step: int, *, seen_fire: str = frame.FIRE) -> None:
+    """Draws the map of an episode at a step with links, targets, and UAVs in their roles."""
     now = {name: values[step] for name, values in episode.steps.items()}
-    chart = Chart(
-        episode.fire_map(step),
-        now["position"],
-        view_angle=episode.world.view_angle,
-        scale=scale,
-        seen_fire=seen_fire,
-        alive=now["alive"],
-        base=episode.world.base,
-    )
-    places = [chart.point(x, y) for x, y, _ in now["position"].tolist()]
-    half, roles, few = _mark_size(scale), episode.roles(step), len(places) <= MANY
+    world, alive, places = episode.world, now["alive"], now["position"][:, :2]
+    about = {"view_angle": world.view_angle, "alive": alive, "base": world.base}
+    frame.draw_map(axes, episode.fire_map(step), now["position"], seen_fire=seen_fire, **about)
+    few = len(places) <= MANY
     if episode.listens:
-        radios = [*places, *([chart.point(*episode.world.base)] if episode.world.base else [])]
-        pairs = np.argwhere(np.triu(now["hears"] | now["hears"].T, 1)).tolist()
+        radios = np.concatenate((places, [world.base])) if world.base else places
+        links = radios[np.argwhere(np.triu(now["hears"] | now["hears"].T, 1))]
         # The dark edges of many links would hide the map.
-        for colour, width in (LINK_WIDTHS if few else {LINK: 1}).items():
-            for i, j in pairs:
-                chart.pen.line((radios[i], radios[j]), fill=colour, width=width)
-    flying = [uav for uav, flies in enumerate(now["alive"]) if flies]
-    for uav in flying if "target" in now else ():
-        end, role = chart.point(*now["target"][uav, :2].tolist()), roles[uav]
-        colour = TARGET if role is None else ROLE_COLOURS[role]
-        if few:
-            _dashes(chart.pen, places[uav], end, colour)
-        frame.draw_cross(chart.pen, end, half * 0.6, colour)
-    for uav, (place, role) in enumerate(zip(places, roles, strict=True)):
-        if uav not in flying:
-            frame.draw_cross(chart.pen, place, half, frame.FAILED)
-        elif role is None:
-            chart.draw_uav(*now["position"][uav, :2].tolist())
-        else:
-            _draw_uav(chart.pen, place, half, role)
-    return chart.image
+        for colour, width in {frame.NO_FIRE: 3.0, LINK: 1.5}.items() if few else ((LINK, 0.75),):
+            _lines(axes, links, colors=colour, linewidths=width)
+    roles = np.array(episode.roles(step))
+    for role in dict.fromkeys(roles[alive]):
+        of_role = alive & (roles == role)
+        style = {"color": NO_ROLE} if role is None else ROLE_MARKS[role]
+        if role is not None:
+            mark(axes, places[of_role], zorder=4, **style)
+        if "target" in now:
+            targets = now["target"][of_role, :2]
+            mark(axes, targets, **TARGET, color=style["color"])
+            if few:
+                lines = np.stack((places[of_role], targets), 1)
+                _lines(axes, lines, colors=style["color"], linestyles=(0, (3, 3)), linewidths=1)
 
 
 def even_steps(horizon: int, frames: int) -> list[int]:
@@ -179,84 +139,12 @@ def even_steps(horizon: int, frames: int) -> list[int]:
     return steps.tolist()
 
 
-def scale_of(grid: Sequence[int], size: int) -> int:
-    """Returns pixels per cell, so that the longer side has about `size` pixels.
-
-    A narrow map is drawn up to twice as large.
-    """
-    longer, shorter = max(grid), min(grid)
-    wide = min(2 * size // longer, math.ceil(size / 4 / shorter))
-    return max(2, size // longer, wide)
+def _lines(axes: Axes, lines: NDArray[Any], **style: Any) -> None:
+    """Draws lines, [k, 2, 2] in cells."""
+    drawn = LineCollection(list(lines), zorder=3, antialiaseds=False, **style)
+    axes.add_collection(drawn, autolim=False)
 
 
-def _mark_size(scale: int) -> float:
-    """Returns half the width of a UAV's mark, pixels, on a chart of `scale` pixels per cell."""
-    return min(max(0.55 * scale, 6.0), 9.0)
-
-
-def _columns(count: int, width: int, height: int) -> int:
-    """Returns the number of columns for which the panels fit into the smallest square."""
-
-    def side(columns: int) -> int:
-        return max(columns * width, math.ceil(count / columns) * height)
-
-    return min(range(1, count + 1), key=lambda columns: (side(columns), -columns))
-
-
-def _dashes(pen: Pen, start: tuple[float, float], end: tuple[float, float], colour: Colour) -> None:
-    """Draws a thin line with dashes and gaps of 4 pixels."""
-    offset = np.subtract(end, start)
-    length = float(np.hypot(*offset))
-    for dash, (near, far) in enumerate(pairwise([*np.arange(0, length, 4), length])):
-        if dash % 2 == 0:
-            points = (tuple(np.add(start, offset * (stop / length))) for stop in (near, far))
-            pen.line(tuple(points), fill=colour)
-
-
-def _draw_uav(pen: Pen, place: tuple[float, float], half: float, role: int | None) -> None:
-    """Draws a UAV as a blue disc, within a shape in the colour of its role if it has one."""
-    x, y = place
-    if role is not None:
-        corners = [(x + half * right, y + half * down) for right, down in _SHAPES[role]]
-        pen.polygon(corners, fill=ROLE_COLOURS[role], outline=frame.NO_FIRE)
-        half *= 0.5
-    pen.ellipse((x - half, y - half, x + half, y + half), fill=frame.UAV)
-
-
-# Samples of the legend
-
-
-def _box(colour: Colour) -> Sample:
-    def sample(pen: Pen, x: float, y: float) -> None:
-        pen.rectangle((x - 8, y - 6, x + 8, y + 6), fill=colour, outline=frame.NO_FIRE)
-
-    return sample
-
-
-def _uav_sample(half: float, role: int | None) -> Sample:
-    def sample(pen: Pen, x: float, y: float) -> None:
-        pen.rectangle((x - 9, y - 9, x + 9, y + 9), fill=frame.FIELD_OF_VIEW)
-        _draw_uav(pen, (x, y), half, role)
-
-    return sample
-
-
-def _link_sample(pen: Pen, x: float, y: float) -> None:
-    for colour, width in LINK_WIDTHS.items():
-        pen.line((x - 8, y, x + 10, y), fill=colour, width=width)
-
-
-def _target_sample(colour: Colour) -> Sample:
-    def sample(pen: Pen, x: float, y: float) -> None:
-        _dashes(pen, (x - 8, y), (x + 5, y), colour)
-        frame.draw_cross(pen, (x + 5, y), 4, colour)
-
-    return sample
-
-
-def _base_sample(pen: Pen, x: float, y: float) -> None:
-    frame.draw_base(pen, (x, y), 6)
-
-
-def _failed_sample(pen: Pen, x: float, y: float) -> None:
-    frame.draw_cross(pen, (x, y), 6, frame.FAILED)
+def _cell(colour: str) -> dict[str, Any]:
+    """Returns the sample of a cell."""
+    return {"color": colour, "marker": "s", "ms": 11, "mec": frame.NO_FIRE}

@@ -7,6 +7,7 @@ import imageio_ffmpeg
 import numpy as np
 import torch
 from PIL import Image
+from PIL.ImageColor import getrgb
 from refusal import refused
 
 from emberlink.envs.utils.config_files import known
@@ -116,7 +117,7 @@ def test_a_picture_of_another_grid(tmp_path, capsys):
     out = tmp_path / "shot.png"
     assert rendered(capsys, run, "--output", out, "--step", 5, "--size", 200)[-1] == str(out)
     with Image.open(out) as picture:
-        assert tuple(LINK) in {colour for _, colour in picture.convert("RGB").getcolors(256)}
+        assert getrgb(LINK) in {colour for _, colour in picture.getcolors(1 << 24)}
 
 
 def test_errors_of_render(tmp_path, capsys):

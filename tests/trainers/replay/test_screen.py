@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from PIL.ImageColor import getrgb
 
 from emberlink.envs import WildfireConfig
-from emberlink.envs.rendering.frame import BURNT_OUT, FAILED, FIELD_OF_VIEW, MISSED, UAV
+from emberlink.envs.rendering import frame
+from emberlink.trainers.replay import screen
 from emberlink.trainers.replay.recording import Episode, Recording
-from emberlink.trainers.replay.screen import LINK, ROLE_COLOURS, SEEN_FIRE, TARGET, Screen
 
 WHERE = [(2, 2, 1), (12, 2, 1), (22, 12, 1)]
 FOLLOWS = np.array([0, 0, -1])
@@ -44,13 +45,11 @@ def recorded(
 
 
 def around(episode: Recording, place, reach: int = 2, **options) -> set[tuple[int, ...]]:
-    """Returns the colours of the last step near a position in cells of a 30 x 20 grid."""
-    made = Screen([Episode(title="one", recording=episode)], size=360, **options)
-    (left, top), (width, height) = made.map_corner(0), made.map_size
-    image = made.picture(1)[top : top + height, left : left + width]
-    scale = width // 30
-    across, down = int((place[0] + 0.5) * scale), int((19.5 - place[1]) * scale)
-    near = image[down - reach : down + reach + 1, across - reach : across + reach + 1]
+    """Returns the colours of the last step near a position in cells."""
+    made = screen.Screen([Episode(title="one", recording=episode)], size=360, **options)
+    image = made.picture(1)
+    across, up = made.axes[0].transData.transform(place).round().astype(int)
+    near = image[::-1][up - reach : up + reach + 1, across - reach : across + reach + 1]
     return {tuple(colour) for colour in near.reshape(-1, 3).tolist()}
 
 
@@ -60,7 +59,15 @@ def linked(i: int, j: int, n: int = 3) -> np.ndarray:
     return links
 
 
-FIRE = (255, 255, 255)
+FIRE, BURNT_OUT, MISSED, FIELD_OF_VIEW, LINK, TARGET, SEEN_FIRE = map(
+    getrgb,
+    (
+        *(frame.FIRE, frame.BURNT_OUT, frame.MISSED, frame.FIELD_OF_VIEW),
+        *(screen.LINK, screen.NO_ROLE, screen.SEEN_FIRE),
+    ),
+)
+ROLE_COLOURS = [getrgb(style["color"]) for style in screen.ROLE_MARKS]
+UAV, FAILED = getrgb(frame.UAV["color"]), getrgb(frame.FAILED["color"])
 CELLS = {"burns": [(25, 5)], "seen": [(27, 5)], "missed": [(27, 7)]}
 FAILED_UAV = {"alive": np.array([False, False, True]), "target": np.full((3, 3), 12.0, np.float32)}
 
