@@ -91,7 +91,8 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         if env.batch_size != (1,):
             raise UserError(f"env: a batch size of [1] is needed, got {list(env.batch_size)}")
         self.render_mode = render_mode
-        self._env, self._core = env, getattr(env, "base_env", env)
+        core: Any = getattr(env, "base_env", env)
+        self._env, self._core = env, core
         self._now: TensorDictBase | None = None
         self._unplayed: int | None = None
         self.possible_agents = self._core.group_map[keys.AGENTS]
