@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-from pydantic import Discriminator, Tag, ValidationError
+from pydantic import Discriminator, Tag
 from torch import Tensor
 
 from emberlink.envs import fire_files
@@ -24,14 +24,14 @@ from emberlink.envs.fire.generator import (
 from emberlink.envs.fire.reaction import ReactionConfig
 from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import TAG, describe
+from emberlink.envs.utils.validation import TAG
 from emberlink.envs.world.coverage_map import split_times, with_burn_time
 
 Grid = tuple[int, int]
 
 
 class FireSource(ABC):
-    """The fires of a scenario, in three sets: `train`, `validation` and `test`.
+    """The fires of a scenario, in three sets: "train", "validation" and "test".
 
     The validation fires choose among the checkpoints of a training, the test fires measure its
     result. Generated fires of different sets never have a seed in common. A scenario without files
@@ -41,20 +41,15 @@ class FireSource(ABC):
     config: Any
 
     @abstractmethod
-    def train(self, grid: Grid, horizon: int) -> Tensor:
-        """Returns the training fires: times in steps, see `world.coverage_map.split_times`."""
+    def fires(self, split: Split, count: int | None, grid: Grid, horizon: int) -> Tensor:
+        """Returns the times in steps of the first `count` fires of a set; fewer are repeated.
 
-    @abstractmethod
-    def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        """Returns the times of the first `count` validation fires; fewer are repeated."""
-
-    @abstractmethod
-    def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        """Returns the times of the first `count` test fires; fewer are repeated."""
+        All training fires for None. See `world.coverage_map.split_times`.
+        """
 
     def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
-        """Returns the times of the test fire of that index, as `test(1, ...)`."""
-        return self.test(index + 1, grid, horizon)[index:]
+        """Returns the times of the test fire of that index, with a first dimension of 1."""
+        return self.fires("test", index + 1, grid, horizon)[index:]
 
     @abstractmethod
     def describe(self, count: int) -> dict[str, Any]:
@@ -69,9 +64,9 @@ class FireSource(ABC):
         del grid, horizon
         return ""
 
-    def save_copy(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
-        """Copies the fires of files into a run folder and returns `load_copy(folder)`."""
-        return self.config
+    def save_copy(self, folder: Path, grid: Grid, horizon: int) -> None:
+        """Copies the fires of files into a run folder, for `load_copy`."""
+        del folder, grid, horizon
 
     def load_copy(self, folder: Path) -> "ScenarioConfig":
         """Returns the scenario that reads its fires from the copy in a run folder."""
@@ -84,21 +79,13 @@ class Generated(FireSource):
 
     config: GeneratedConfig
 
-    def train(self, grid: Grid, horizon: int) -> Tensor:
-        return self._bank("train", self.config.num_train_fires, grid, horizon)
-
-    def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        return self._bank("validation", count, grid, horizon)
-
-    def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        return self._bank("test", count, grid, horizon)
+    def fires(self, split: Split, count: int | None, grid: Grid, horizon: int) -> Tensor:
+        count = self.config.num_train_fires if count is None else count
+        return self._with_burn_time(fire_bank(self.config, split, count, grid, horizon))
 
     def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
         seeds = fire_seeds("test", index + 1, self.config.test_seed)[index:]
         return self._with_burn_time(make_fires(self.config, seeds, grid, horizon))
-
-    def _bank(self, split: Split, count: int, grid: Grid, horizon: int) -> Tensor:
-        return self._with_burn_time(fire_bank(self.config, split, count, grid, horizon))
 
     def _with_burn_time(self, fires: Tensor) -> Tensor:
         if isinstance(self.config, ReactionConfig):
@@ -107,13 +94,11 @@ class Generated(FireSource):
 
     def describe(self, count: int) -> dict[str, Any]:
         """Returns their seeds, and the fields of the scenario that differ from their defaults."""
-        values = {
-            field.name: getattr(self.config, field.name)
-            for field in dataclasses.fields(self.config)
-            if getattr(self.config, field.name) != field.default
-        }
+        fields = dataclasses.fields(self.config)
+        values = {field.name: getattr(self.config, field.name) for field in fields}
+        changed = {f.name: values[f.name] for f in fields if values[f.name] != f.default}
         seeds = fire_seeds("test", count, self.config.test_seed)
-        return {"fire_seeds": seeds.tolist(), "scenario": values}
+        return {"fire_seeds": seeds.tolist(), "scenario": changed}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,19 +107,10 @@ class FromFile(FireSource):
 
     config: FileFireConfig
 
-    def train(self, grid: Grid, horizon: int) -> Tensor:
-        return self._with_burn_time(fire_files.fire_sets(self.config, grid, horizon).train)
-
-    def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        fires = fire_files.fire_sets(self.config, grid, horizon).validation
-        return self._with_burn_time(fires[torch.arange(count) % len(fires)])
-
-    def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        fires = fire_files.fire_sets(self.config, grid, horizon).test
-        return self._with_burn_time(fires[torch.arange(count) % len(fires)])
-
-    def _with_burn_time(self, arrival: Tensor) -> Tensor:
-        return with_burn_time(arrival, self.config.burn_time)
+    def fires(self, split: Split, count: int | None, grid: Grid, horizon: int) -> Tensor:
+        every = getattr(fire_files.fire_sets(self.config, grid, horizon), split)
+        chosen = every if count is None else every[torch.arange(count) % len(every)]
+        return with_burn_time(chosen, self.config.burn_time)
 
     def describe(self, count: int) -> dict[str, Any]:
         """Returns how many they are, and the scenario with the checksum of its file."""
@@ -150,9 +126,8 @@ class FromFile(FireSource):
     def summary(self, grid: Grid, horizon: int) -> str:
         return fire_files.fire_sets(self.config, grid, horizon).about
 
-    def save_copy(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
+    def save_copy(self, folder: Path, grid: Grid, horizon: int) -> None:
         fire_files.save_copy(self.config, folder, grid, horizon)
-        return self.load_copy(folder)
 
     def load_copy(self, folder: Path) -> "ScenarioConfig":
         return dataclasses.replace(self.config, saved_copy=str(folder / COPY_FILE))
@@ -201,16 +176,9 @@ def grid_of(fire: Any) -> tuple[int, int] | None:
 
 
 def default_config(fire: Any) -> WildfireConfig:
-    """Returns the default config, on the grid of the fire if that is a tensor or an array.
-
-    Raises:
-        UserError: a grid cannot have this size.
-    """
+    """Returns the default config, on the grid of the fire if that is a tensor or an array."""
     grid = grid_of(fire)
-    try:
-        return WildfireConfig() if grid is None else WildfireConfig(grid=grid)
-    except ValidationError as error:
-        raise UserError(f"fire: {describe(error)}") from None
+    return WildfireConfig() if grid is None else WildfireConfig(grid=grid)
 
 
 def load_fires(
@@ -229,7 +197,7 @@ def load_fires(
     if isinstance(fire, str):
         fire = load_scenario(fire)
     if isinstance(fire, ScenarioConfig):
-        return fires_of(fire).train(config.grid, config.horizon), False
+        return fires_of(fire).fires("train", None, config.grid, config.horizon), False
     # A copy, because the caller may change theirs later.
     bank = torch.as_tensor(fire, dtype=torch.float32).clone(memory_format=torch.contiguous_format)
     shape = list(bank.shape)

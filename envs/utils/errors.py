@@ -5,6 +5,7 @@ import re
 import reprlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import PurePath
 from typing import Any
 
@@ -25,6 +26,12 @@ def naming(path: object, *more: type[Exception]) -> Iterator[None]:
     except (OSError, ValueError, RecursionError, *more) as error:
         text = " ".join(str(getattr(error, "strerror", None) or error).split())[:300]
         raise UserError(text if str(path) in text else f"{path}: {text}") from None
+
+
+def require(package: str, extra: str, key: str) -> None:
+    """Checks that a package of an extra, which the setting `key` needs, is installed."""
+    if find_spec(package) is None:
+        raise UserError(f"{key}: {package} is not installed: {how_to_install(extra)}")
 
 
 def how_to_install(extra: str) -> str:

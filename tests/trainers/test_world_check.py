@@ -47,7 +47,7 @@ def test_check_plays_on_validation_fires_as_an_evaluation_does(tmp_path):
     found = json.loads(file.read_text())["front"]
     assert found["passes"] == (status == 0) == all(c["passes"] for c in found["conditions"])
     config = resolve("independent", ["world=front", *TINY])
-    fires = fires_of(config.fire).validation(3, (12, 12), 12)
+    fires = fires_of(config.fire).fires("validation", 3, (12, 12), 12)
     measured = evaluate.play_blocks(
         config,
         SCRIPTED.find("map_greedy"),

@@ -22,6 +22,8 @@ EXTRAS = {
     "svg": "the figures as SVG",
 }
 """what `compare` can write beside its page -> its help"""
+_OVERRIDES: dict[str, Any] = {"metavar": "key=value", "nargs": "*", "default": []}
+_REPEATABLE: dict[str, Any] = {"action": "append", "default": []}
 
 
 def add_train(commands: Any) -> None:
@@ -36,21 +38,10 @@ def add_train(commands: Any) -> None:
         usage="emberlink train METHOD [key=value ...]\n"
         "       emberlink train resume=RUN [key=value ...]",
     )
-    add(
-        "method",
-        metavar="METHOD",
-        help="a method: independent, shared_memory, positional, consensus, maps, or your own "
-        "(see emberlink list methods); or resume=RUN, to resume the training of a run folder",
-    )
-    _add_overrides(
-        add,
-        "any key of configs/base.yaml or of the chosen setup, such as setup=tuned, fire=huygens, "
-        "seed=1, env.num_uavs=3, logger=csv",
-    )
-
-
-def _add_overrides(add: Callable[..., Any], text: str) -> None:
-    add("overrides", metavar="key=value", nargs="*", default=[], help=text)
+    method = "a method of emberlink list methods; or resume=RUN, to resume the training of a run"
+    add("method", metavar="METHOD", help=method)
+    keys = "any key of configs/base.yaml, such as setup=tuned, fire=huygens, seed=1, env.num_uavs=3"
+    add("overrides", help=keys, **_OVERRIDES)
 
 
 def _checked(place: str) -> Callable[[argparse.Namespace, "Console"], int]:
@@ -95,17 +86,14 @@ def add_eval(commands: Any) -> None:
         usage="emberlink eval RUN [key=value ...]\n"
         "       emberlink eval POLICY METHOD [key=value ...] --name NAME",
     )
+    run = "a run folder or pretrained:METHOD; or a policy: file.py:NAME, module:NAME or file.onnx"
+    add("folder", metavar="RUN | POLICY", help=run)
     add(
-        "folder",
-        metavar="RUN | POLICY",
-        help="a run folder, pretrained:METHOD or pretrained:SETUP/METHOD; or a policy of your own: "
-        "file.py:NAME, module:NAME or file.onnx",
-    )
-    _add_overrides(
-        add,
-        "keys of comm. or env. to change, such as env.radio.loss=0.5, world=NAME, or "
+        "overrides",
+        help="keys of comm. or env. to change, such as env.radio.loss=0.5, world=NAME, or "
         "evaluation.scripted=[] for the frozen policies alone; the names of the files contain "
         "them. After POLICY: the method whose observations it reads, and keys as for train",
+        **_OVERRIDES,
     )
     add("--name", help="what comparisons call a policy of your own")
     add("--checkpoint", metavar="FILE", type=path, help="a checkpoint (default: the newest)")
@@ -123,7 +111,7 @@ def add_export(commands: Any) -> None:
         "what they read and write, in which units. No existing file is replaced.",
         "emberlink export pretrained:consensus consensus.onnx",
     )
-    add("folder", metavar="RUN", help="a run folder, or pretrained:METHOD, pretrained:SETUP/METHOD")
+    add("folder", metavar="RUN", help="a run folder, or pretrained:METHOD")
     add("file", metavar="FILE.onnx", type=path, help="a new file")
 
 
@@ -146,21 +134,11 @@ def add_compare(commands: Any) -> None:
         "claims; writes compare.html, with all tables and figures, and compare.json to a folder.",
         "emberlink compare runs/ --output comparison",
     )
-    add(
-        "folders",
-        metavar="RUN",
-        nargs="+",
-        type=path,
-        help="run folders, folders of run folders, or names such as pretrained:tuned",
-    )
+    folders = "run folders, folders of run folders, or names such as pretrained:tuned"
+    add("folders", metavar="RUN", nargs="+", type=path, help=folders)
     add("--output", metavar="FOLDER", type=path, help="a new folder (default: compare)")
-    add(
-        "--label",
-        metavar="NAME",
-        action="append",
-        default=[],
-        help="name of the runs of the first RUN, of the second, and so on (default: their method)",
-    )
+    label = "name of the runs of the first RUN, of the second, and so on (default: their method)"
+    add("--label", metavar="NAME", help=label, **_REPEATABLE)
     extras: dict[str, Any] = {"action": "append_const", "dest": "extras", "default": []}
     for name, what in EXTRAS.items():
         add(f"--{name}", const=name, help=f"also write {what}", **extras)
@@ -208,15 +186,14 @@ def add_render(commands: Any) -> None:
         help="a run folder, or pretrained:METHOD; after it KEY=VALUE, such as env.radio.range=0, "
         "for other settings of env and comm, or world=NAME",
     )
-    several: dict[str, Any] = {"action": "append", "default": []}
-    add("--policy", metavar="NAME", help="a scripted policy to draw, too; repeatable", **several)
-    add(
-        "--fire",
-        help="a held-out fire: NAME, INDEX or NAME:INDEX, such as huygens:3 (default: huygens:0, "
-        "or the first of the run's own fires if evaluations leave huygens out)",
+    policy = "a scripted policy to draw, too; repeatable"
+    add("--policy", metavar="NAME", help=policy, **_REPEATABLE)
+    fire = (
+        "a held-out fire: NAME, INDEX or NAME:INDEX (default: huygens:0, or the first of the run)"
     )
-    about = {"metavar": "FILE", "help": "a checkpoint in place of the newest; one for each run"}
-    add("--checkpoint", type=path, **about, **several)
+    add("--fire", help=fire)
+    file = "a checkpoint in place of the newest; one for each run"
+    add("--checkpoint", metavar="FILE", type=path, help=file, **_REPEATABLE)
     kinds = "a folder, or a new file: .html (a page to play), .gif, .mp4 or .png (one picture)"
     add("--output", metavar="PATH", type=path, help=kinds)
     add("--step", metavar="STEP", type=between(0), help="step of a .png (default: the last)")
@@ -260,7 +237,7 @@ def add_tune(commands: Any) -> None:
         "emberlink tune consensus setup=strong world=front --trials 20",
     )
     add("method", metavar="METHOD", help="a method, as for train")
-    _add_overrides(add, "keys as for train, which all trials have")
+    add("overrides", help="keys as for train, which all trials have", **_OVERRIDES)
     add("--trials", metavar="N", type=positive, default=20, help="number of trials (default: 20)")
     what = "a YAML file of keys and values to try (default: that of the learner in configs/space)"
     add("--space", metavar="FILE", type=path, help=what)
@@ -284,13 +261,8 @@ def add_world(commands: Any) -> None:
         "conditions of the suite. The exit status is 1 if a world does not satisfy one.",
         "emberlink world check front fire.burn_time=90 --validation --fires 32",
     )
-    add(
-        "arguments",
-        metavar="NAME | key=value",
-        nargs="*",
-        help="worlds (default: all that evaluate the needed policies); keys of the world to "
-        "change, such as fire.burn_time=90 or setup=tuned",
-    )
+    names = "worlds (default: those of the suite); keys to change, such as fire.burn_time=90"
+    add("arguments", metavar="NAME | key=value", nargs="*", help=names)
     add("--fires", metavar="N", type=positive, default=100, help="number of fires (default: 100)")
     on_validation = {"const": "validation", "default": "test", "action": "store_const"}
     why = "play on validation fires, for the design of a world, in place of test fires"

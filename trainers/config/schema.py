@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
+    Field,
     PlainValidator,
     SerializeAsAny,
     Strict,
@@ -23,7 +24,6 @@ from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.utils.validation import (
     STRICT,
     CountOrZero,
-    check_device,
     from_plain,
     shown,
 )
@@ -45,13 +45,14 @@ def _settings(key: str, values: Any, plugins: Plugins) -> Any:
     if not isinstance(values, Mapping) or not isinstance(name := values.get("name"), str):
         raise UserError(f"{key}={shown(values)}: expected a name and settings")
     config_type = plugins.find(name).config_type
-    known = [field.name for field in fields(config_type)]
     # A type may have the name among its fields.
-    given = {name: value for name, value in values.items() if name != "name" or name in known}
-    for setting in given.keys() - set(known):
-        listed = ", ".join(known) or "none"
-        raise UserError(f"{key}.{setting} is not a setting of {name}; known: {listed}")
+    named = any(field.name == "name" for field in fields(config_type))
+    given = values if named else {k: v for k, v in values.items() if k != "name"}
     return from_plain(config_type, given, key)
+
+
+def _known(plugins: Plugins) -> AfterValidator:
+    return AfterValidator(lambda name: plugins.find(name) and name)
 
 
 LearnerChoice = Annotated[
@@ -73,19 +74,12 @@ class EvaluationConfig:
     """episodes of an evaluation during training, each on another validation fire"""
     huygens: bool
     """whether to evaluate on fires of `huygens` besides the training's scenario"""
-    scripted: Annotated[tuple[str, ...], Strict(False)]
+    scripted: Annotated[tuple[Annotated[str, _known(SCRIPTED)], ...], Strict(False)]
     """scripted policies to evaluate"""
     headline: str
     """the measure that chooses the networks of best.safetensors on validation fires"""
     message_fault: Literal["none", "zero", "shuffle"] = "none"
     """what happens to learned messages when a frozen policy is evaluated (`Messages.fault`)"""
-
-    @field_validator("scripted")
-    @classmethod
-    def _check_policies(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        for name in value:
-            SCRIPTED.find(name)
-        return value
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -100,7 +94,7 @@ class RunConfig(Basics):
     """settings of the learning algorithm"""
     evaluation: EvaluationConfig
     """settings of the evaluations"""
-    device: Annotated[str, AfterValidator(check_device)]
+    device: Annotated[str, Field(min_length=1)]
     """device of the environment, the replay buffer and the networks"""
 
     @model_validator(mode="after")

@@ -7,7 +7,7 @@ import json
 import math
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from copy import deepcopy
 from functools import lru_cache, reduce
 from operator import getitem
@@ -17,6 +17,7 @@ from typing import Any
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from hydra.version import VersionBase
 from omegaconf import OmegaConf
@@ -52,26 +53,22 @@ def composed(method: str, overrides: Sequence[str] = (), **settings: Any) -> dic
     `overrides` are texts `key=value`, as on the command line; see `full_key` for `settings`.
     """
     names = {"method": str(method), "setup": "paper", "world": "paper"}
-    for text in overrides:
-        key, equals, _ = text.partition("=")
-        if equals and key in GROUPS:
-            names[key] = str(parse(text)[1])
+    chosen = [text for text in overrides if text.partition("=")[0] in GROUPS]
+    names |= {key: str(name) for key, name in map(parse, chosen)}
     values = _from_files(names)
     _drop_settings_of_others(values["learner"])
-    changed = [text for text in overrides if text.partition("=")[0] not in GROUPS]
-    change(values, changed, settings)
+    change(values, [text for text in overrides if text not in chosen], settings)
     values = _interpolated(values)
     return values | {group: names[group] for group in ("method", "setup", "world")}
 
 
 def _drop_settings_of_others(learner: dict[str, Any]) -> None:
     """Removes settings of other learners that a setup holds, such as `critic_lr` for PPO."""
-    own, others = _keys_of(learner["name"]), set[str]()
-    for name in config_files.known("learner") if learner.keys() - own else ():
-        with suppress(UserError):  # another package's file that cannot be read
-            others |= _keys_of(name)
-    for key in learner.keys() & others - own:
-        del learner[key]
+    own = _keys_of(learner["name"])
+    if learner.keys() - own:
+        others = set().union(*map(_keys_of, config_files.known("learner")))
+        for key in learner.keys() & others - own:
+            del learner[key]
 
 
 def _keys_of(learner: str) -> set[str]:
@@ -112,18 +109,24 @@ def parse(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise UserError(f"{shown(text)!r} is not of the form key=value")
-    try:
-        parsed = OverridesParser.create().parse_override(text)
-    except (HydraException, ValueError, RecursionError):
+    if (override := parsed(text)) is None:
         return key, value
-    if parsed.is_sweep_override():
+    if override.is_sweep_override():
         raise UserError(
             f"{shown(text)!r}: only one value is possible here; a list stands in brackets, several "
             "runs are a sweep (emberlink sweep --help)"
         )
-    given = parsed.value()
+    given = override.value()
     # As in the files; Hydra's grammar knows `inf` only.
-    return parsed.get_key_element(), math.inf if given == ".inf" else given
+    return override.get_key_element(), math.inf if given == ".inf" else given
+
+
+def parsed(text: str) -> Override | None:
+    """Returns Hydra's view of `key=value`; None if its grammar cannot read the text."""
+    try:
+        return OverridesParser.create().parse_override(text)
+    except (HydraException, ValueError, RecursionError):
+        return None
 
 
 def put(values: dict[str, Any], key: str, value: Any) -> None:

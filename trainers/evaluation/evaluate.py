@@ -105,7 +105,7 @@ def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
     """
     grid, horizon = config.env.grid, config.env.horizon
     return {
-        name: fires_of(scenario).test(count, grid, horizon)
+        name: fires_of(scenario).fires("test", count, grid, horizon)
         for name, scenario in evaluation_scenarios(config).items()
     }
 
@@ -160,7 +160,8 @@ def validate(config: RunConfig, actor: Policy) -> dict[str, float]:
     count = config.evaluation.interval_episodes
     result: dict[str, float] = {}
     for name, scenario in evaluation_scenarios(config).items():
-        arrival = fires_of(scenario).validation(count, config.env.grid, config.env.horizon)
+        source, world = fires_of(scenario), config.env
+        arrival = source.fires("validation", count, world.grid, world.horizon)
         seed, block = VALIDATION_START_SEED, min(count, BLOCK)
         measured = play_learned(config, actor, arrival, start_seed=seed, block=block)
         result |= {f"{name}/{measure}": value for measure, value in means(measured).items()}

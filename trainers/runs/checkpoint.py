@@ -9,7 +9,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 from safetensors import SafetensorError, safe_open
@@ -22,6 +21,7 @@ from emberlink.envs.utils.validation import STRICT, CountOrZero, from_plain, sho
 from emberlink.trainers.config.compose import differences, from_values, to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR
+from emberlink.trainers.learners.tensors import check_like
 
 FORMAT = 2
 """version of the file format; files of another version are refused"""
@@ -109,38 +109,23 @@ def load_weights(
 
     `config` is the configuration of the networks that get the weights, for messages.
     """
-    header, weights = read_header(path), read_tensors(path, WEIGHTS)
-    if reason := _misfit(weights, expected):
+    header, every = read_header(path), read_tensors(path, WEIGHTS)
+    weights = {k: v for k, v in every.items() if k.startswith(ACTOR) or k in expected}
+    try:
+        check_like(expected, weights)
+    except ValueError as reason:
         changed = [
             f"{key}={shown(now)} (in training {shown(before)})"
             for key, (now, before) in differences(config, header.config).items()
             if key.startswith(("env.", "comm.", "policy"))
         ]
-        raise UserError(f"{path}: does not fit {', '.join(changed) or 'the run'}: {reason}")
-    chosen = {name: weights[name] for name in expected}
-    if name := first_non_finite(chosen):
+        fits = ", ".join(changed) or "the run"
+        raise UserError(f"{path}: does not fit {fits}: {reason}") from None
+    if name := first_non_finite(weights):
         raise UserError(f"{path}: {name} holds NaN or infinite numbers")
-    return chosen
+    return weights
 
 
 def first_non_finite(tensors: Mapping[str, Tensor]) -> str | None:
     """Returns the name of the first tensor that holds NaN or Inf, or None."""
-    for name, value in tensors.items():
-        if value.is_floating_point() and not torch.isfinite(value).all():
-            return name
-    return None
-
-
-def _misfit(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> str:
-    """Returns how weights differ from the expected ones; "" if they fit."""
-    for name, tensor in expected.items():
-        if name not in weights:
-            return f"holds no {name}"
-        weight = weights[name]
-        if weight.shape != tensor.shape or weight.dtype != tensor.dtype:
-            return (
-                f"{name} has shape {list(weight.shape)}, {weight.dtype}; expected "
-                f"{list(tensor.shape)}, {tensor.dtype}"
-            )
-    more = [name for name in weights if name.startswith(ACTOR) and name not in expected]
-    return f"holds {more[0]}, which is not expected" if more else ""
+    return next((name for name, value in tensors.items() if not value.isfinite().all()), None)

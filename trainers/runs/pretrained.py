@@ -68,16 +68,12 @@ def find(text: str) -> list[Path]:
     """
     folders = sorted((file.parent for file in _shipped().glob("*/*/*/config.yaml")), key=_order)
     name = text.removeprefix(PREFIX).strip("/")
-    wanted = tuple(re.sub(r"/(\d+)$", r"/s\1", name).split("/"))
-    matching = [path for path in folders if path.parts[-3:][: len(wanted)] == wanted]
-    for setups in (*USUAL_SETUPS, "*"):
-        matching = matching or [
-            p for p in folders if fnmatch(p.parts[-3], setups) and p.parts[-2] == name
-        ]
-    if not matching:
-        known = ", ".join("/".join(path.parts[-3:]) for path in folders)
-        raise UserError(f"{text}: no such trained policy; known: {known}")
-    return matching
+    wanted = re.sub(r"/(\d+)$", r"/s\1", name)
+    names = {"/".join(path.parts[-3:]): path for path in folders}
+    for pattern in (wanted, *(f"{setup}/{wanted}" for setup in (*USUAL_SETUPS, "*"))):
+        if matching := [path for n, path in names.items() if fnmatch(f"{n}/", f"{pattern}/*")]:
+            return matching
+    raise UserError(f"{text}: no such trained policy; known: {', '.join(names)}")
 
 
 def find_one(text: str) -> Path:

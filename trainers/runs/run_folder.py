@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from pydantic import TypeAdapter
 
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils import atomic_io
@@ -27,6 +28,7 @@ BEST = "best.safetensors"
 """file of the networks with the best headline measure"""
 METRICS = "metrics.jsonl"
 """file with a line for each episode"""
+_LINE = TypeAdapter(dict[str, int | float])
 MAX_YAML = 100_000
 """maximum bytes of a config.yaml; a typical one has 2,000"""
 MAX_JSON = 100_000_000
@@ -61,7 +63,6 @@ class RunFolder:
         name = name or f"{stamp}_{config.method}_{config.setup}_{config.world}_s{config.seed}"
         with naming(f"output={config.output}"):
             path = _new_folder(atomic_io.user_path(config.output) / name)
-            (path / "figures").mkdir()
         run = cls(path)
         fires_of(config.fire).save_copy(path, config.env.grid, config.env.horizon)
         run.write_config(config)
@@ -69,9 +70,8 @@ class RunFolder:
 
     def write_config(self, config: RunConfig) -> None:
         """Writes config.yaml completely, or leaves the earlier one."""
-        values = to_values(config)
-        text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
-        self.write_text("config.yaml", text)
+        form: Any = {"sort_keys": False, "default_flow_style": None, "width": 100}
+        self.write_text("config.yaml", yaml.safe_dump(to_values(config), **form))
 
     def values(self) -> dict[str, Any]:
         """Returns the configuration of config.yaml as plain values, without checking them."""
@@ -121,7 +121,8 @@ class RunFolder:
         path = self.path / METRICS
         text = read_text(path, MAX_JSON) if path.exists() else ""
         with naming(path):
-            return [_numbers(line) for line in text[: text.rfind("\n") + 1].splitlines()]
+            lines = text[: text.rfind("\n") + 1].splitlines()
+            return [_LINE.validate_json(line) for line in lines]
 
     def append(self, line: Mapping[str, Any]) -> None:
         """Appends a line to metrics.jsonl."""
@@ -131,13 +132,13 @@ class RunFolder:
 
     def sync_metrics(self) -> None:
         """Flushes metrics.jsonl to the disk; a checkpoint must not be newer than its lines."""
-        if (self.path / METRICS).exists():
+        with suppress(FileNotFoundError):
             atomic_io.sync(self.path / METRICS)
 
     def return_to(self, episode: int) -> None:
         """Removes the lines of later episodes and the incomplete files of a killed process."""
-        lines = [line for line in self.metrics() if line["episode"] <= episode]
-        if [line["episode"] for line in lines] != list(range(1, episode + 1)):
+        lines = [line for line in self.metrics() if line.get("episode", 0) <= episode]
+        if [line.get("episode") for line in lines] != list(range(1, episode + 1)):
             raise UserError(
                 f"{self.path / METRICS}: does not hold a line for each of the {episode} episodes "
                 "of the checkpoint"
@@ -207,15 +208,6 @@ def _is_ordinary(path: Path) -> bool:
     about = path.lstat()
     linked = path.name == "lock" and about.st_nlink > 1
     return stat.S_ISDIR(about.st_mode) or (stat.S_ISREG(about.st_mode) and not linked)
-
-
-def _numbers(line: str) -> dict[str, Any]:
-    """Returns the numbers of a line by name."""
-    value = json.loads(line)
-    numbers = value.values() if isinstance(value, dict) else [""]
-    if "episode" not in value or not all(isinstance(number, int | float) for number in numbers):
-        raise UserError("a line is not of the form {episode: NUMBER, NAME: NUMBER, ...}")
-    return value
 
 
 def _new_folder(path: Path) -> Path:

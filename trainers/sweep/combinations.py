@@ -1,29 +1,25 @@
 """Lists the runs of a sweep, one for each combination of values, and finds them on disk."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
+import json
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
-
 from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.compose import flat, resolve, to_values
+from emberlink.trainers.config.compose import resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
+from emberlink.trainers.config.values import parsed
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.lock import Lock, LockedError
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep.executors.base import Task
 
-_IGNORED = ("output", *NOT_LEARNT_WITH)
-"""first parts of keys that do not tell runs apart"""
 _NAMED = ("setup", "world", "seed")
 """keys whose values are in every name"""
-
-Identity = tuple[tuple[str, str], ...]
 
 
 @dataclass(eq=False)
@@ -79,8 +75,7 @@ class Combination:
         """Creates the run folder if there is none, and returns the task that trains the run."""
         if self.folder is None:
             c = self.config
-            digest = hashlib.sha256(repr(identity(c)).encode()).hexdigest()[:8]
-            name = f"{c.method}_{c.setup}_{c.world}_s{c.seed}_{digest}"
+            name = f"{c.method}_{c.setup}_{c.world}_s{c.seed}_{identity(c)[:8]}"
             # From the configuration and not the arguments: YAML files may have changed since.
             self.folder = RunFolder.create(c, name)
         self.log.parent.mkdir(exist_ok=True)
@@ -96,23 +91,21 @@ def combinations(arguments: Sequence[str]) -> list[Combination]:
     methods = [text for text in arguments if "=" not in text] or list(known("method"))
     choices = [_values(text) for text in arguments if "=" in text]
     several = {_key(texts[0]) for texts in choices if len(texts) > 1} - {*_NAMED}
-    found: dict[Identity, Combination] = {}
-    outputs: set[str] = set()
+    found: dict[str, Combination] = {}
     for method, overrides in product(methods, product(*choices)):
         config = resolve(method, overrides)
-        outputs.add(config.output)
         swept = [text for text in overrides if _key(text) in several]
         free = tuple(text for text in overrides if _key(text) in NOT_LEARNT_WITH)
         found.setdefault(identity(config), Combination(config, swept, free))
     if not found:
         raise UserError("no run: a key has no value, as in seed=range(3,3)")
-    if len(outputs) > 1:
-        raise UserError(f"output={','.join(sorted(outputs))}: a sweep has one output folder")
+    if "output" in several:
+        raise UserError("output: a sweep has one output folder")
     return list(found.values())
 
 
-def find_folders(wanted: Sequence[Combination], output: Path) -> Iterator[str]:
-    """Sets the folder of each run that is in the output folder; yields what cannot be read.
+def find_folders(wanted: Sequence[Combination], output: Path) -> None:
+    """Sets the folder of each run that is in the output folder; warns of what cannot be read.
 
     A folder belongs to a run if it has the same identity, whatever its name; a finished one first.
     """
@@ -122,19 +115,19 @@ def find_folders(wanted: Sequence[Combination], output: Path) -> Iterator[str]:
             continue
         try:
             folder = RunFolder(file.parent)
-            # The device of the run may not exist on this machine.
-            run = by_identity.get(identity(folder.config(device="cpu")))
+            run = by_identity.get(identity(folder.config()))
         except ValueError as error:
-            yield f"{file.parent} is left out: {error}"
+            warnings.warn(f"{file.parent} is left out: {error}", stacklevel=2)
             continue
         if run is not None and not run.finished:
             run.folder = folder
 
 
-def identity(config: RunConfig) -> Identity:
-    """Returns the keys and values that tell a run from others."""
-    values = flat(to_values(config))
-    return tuple(sorted((k, str(v)) for k, v in values.items() if k.split(".")[0] not in _IGNORED))
+def identity(config: RunConfig) -> str:
+    """Returns a hash of the keys and values that tell a run from others."""
+    values = to_values(config).items()
+    told = {key: value for key, value in values if key not in ("output", *NOT_LEARNT_WITH)}
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
 
 def _key(text: str) -> str:
@@ -143,11 +136,7 @@ def _key(text: str) -> str:
 
 def _values(text: str) -> list[str]:
     """Splits `key=1,2` into `key=1` and `key=2` by Hydra's grammar; other texts are unchanged."""
-    try:
-        parsed = OverridesParser.create().parse_override(text)
-        if parsed.is_sweep_override():
-            key = parsed.get_key_element()
-            return [f"{key}={value}" for value in parsed.sweep_string_iterator()]
-    except (HydraException, ValueError, RecursionError):
-        pass  # `resolve` raises the error
-    return [text]
+    override = parsed(text)
+    if override is None or not override.is_sweep_override():
+        return [text]
+    return [f"{_key(text)}={value}" for value in override.sweep_string_iterator()]

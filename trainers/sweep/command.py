@@ -16,7 +16,6 @@ from emberlink.trainers.sweep.combinations import Combination, combinations, fin
 from emberlink.trainers.sweep.executors.base import Executor, make
 from emberlink.trainers.terminal.console import plain_table
 from emberlink.trainers.terminal.signals import Interruption
-from emberlink.trainers.tracking import check_installed
 from emberlink.trainers.training.setup import check_setup
 
 _INTERVAL = 0.5
@@ -41,8 +40,7 @@ def sweep(
     runs = combinations([text for text in arguments if text not in chosen])
     executor = executor or make([*chosen, *([f"executor.workers={jobs}"] if jobs else [])])
     output = user_path(runs[0].config.output)
-    for note in find_folders(runs, output):
-        console.print(f"note: {note}", style="yellow", soft_wrap=True)
+    find_folders(runs, output)
     _check([run for run in runs if run.folder is None])
     if dry_run:
         console.print(_table(runs))
@@ -73,7 +71,6 @@ def _table(runs: Sequence[Combination]) -> Table:
 def _check(runs: Sequence[Combination]) -> None:
     """Checks that new runs can be trained; of several that differ in the seed only, one."""
     for run in {identity(replace(run.config, seed=0)): run for run in reversed(runs)}.values():
-        check_installed(run.config.logger)
         try:
             check_setup(run.config)
         except UserError as error:
@@ -81,39 +78,32 @@ def _check(runs: Sequence[Combination]) -> None:
 
 
 class _Trainings:
-    """Submits runs, follows them with a bar for each, and cancels them after a signal."""
+    """Submits runs, follows them with a bar for all episodes, and cancels them after a signal."""
 
     def __init__(self, executor: Executor, runs: Sequence[Combination], console: Console):
         self._executor, self._runs = executor, runs
         self._waiting = [run for run in runs if not run.finished]
-        self._running: dict[Combination, tuple[Any, progress.TaskID]] = {}
-        self._stopped = False
-        self._most = len(runs) if executor.workers is None else executor.workers
-        self._progress = progress.Progress(
-            progress.TextColumn("{task.description}", markup=False),
-            progress.BarColumn(bar_width=20),
-            progress.MofNCompleteColumn(),
-            progress.TimeElapsedColumn(),
-            console=console,
-        )
-        done = len(runs) - len(self._waiting)
-        self._all = self._progress.add_task("runs", total=len(runs), completed=done)
+        self._running: dict[Combination, Any] = {}
+        self._most = executor.workers or len(runs)
+        self._episodes = {run: run.episodes for run in runs}
+        columns = "{task.description}", progress.BarColumn(), progress.MofNCompleteColumn()
+        self._bars = progress.Progress(*columns, progress.TimeRemainingColumn(), console=console)
 
     def work(self) -> int:
         """Trains all runs and returns the exit status of the sweep."""
-        interruption = Interruption(lambda: None)
-        with interruption, self._progress:
+        total = sum(run.config.episodes for run in self._runs)
+        with Interruption(lambda: None) as interruption, self._bars:
+            bar = self._bars.add_task("episodes", total=total)
             try:
-                while self._running or (self._waiting and not self._stopped):
-                    if not interruption.received:
-                        self._submit()
-                    elif not self._stopped:
-                        self._stop()
+                while (self._running or self._waiting) and not interruption.received:
+                    self._submit()
                     self._look()
-            finally:  # the trainings end also after a second signal or an error
-                self._stop()
+                    self._bars.update(bar, completed=sum(self._episodes.values()))
+            finally:  # the trainings end also after a signal or an error
+                for handle in self._running.values():
+                    self._executor.cancel(handle)
                 while self._running:
-                    self._look()
+                    self._look(stopped=True)
         failed = any(run.failed for run in self._runs)
         return interruption.status if interruption.received else int(failed)
 
@@ -131,34 +121,24 @@ class _Trainings:
             self._say(str(error))
             return
         del self._waiting[: len(batch)]
-        for run, handle in zip(batch, handles, strict=True):
-            bar = self._progress.add_task(run.name, total=run.config.episodes, visible=False)
-            self._running[run] = handle, bar
+        self._running |= zip(batch, handles, strict=True)
 
-    def _look(self) -> None:
-        """Updates the bars and removes the runs that have ended, then waits."""
-        for run, (handle, bar) in list(self._running.items()):
+    def _look(self, stopped: bool = False) -> None:
+        """Counts the episodes and removes the runs that have ended, then waits."""
+        for run, handle in list(self._running.items()):
+            self._episodes[run] = run.episodes
             status = self._executor.poll(handle)
             if status is None:
-                episodes = run.episodes
-                self._progress.update(bar, completed=episodes, visible=episodes > 0)
                 continue
             del self._running[run]
-            if not run.finished and not self._stopped:
+            if not run.finished and not stopped:
                 said = run.log.read_text(errors="replace").split("\n") if run.log.exists() else []
                 run.failed = next(filter(str.strip, said[::-1]), f"exit status {status}").strip()
-            self._progress.remove_task(bar)
-            self._progress.advance(self._all)
             state = "failed" if run.failed else "finished" if run.finished else "stopped"
             self._say(f"{run.name}: {state}")
         if self._running:
             time.sleep(_INTERVAL)
 
     def _say(self, text: str) -> None:
-        """Prints a line above the bars."""
-        self._progress.console.print(f"  {text}", highlight=False, soft_wrap=True)
-
-    def _stop(self) -> None:
-        self._stopped = True
-        for handle, _ in self._running.values():
-            self._executor.cancel(handle)
+        """Prints a line above the bar."""
+        self._bars.console.print(f"  {text}", highlight=False, soft_wrap=True)

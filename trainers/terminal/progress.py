@@ -1,6 +1,5 @@
 """Shows the progress of a training: a line per episode and, on a terminal, a bar."""
 
-from collections.abc import Mapping
 from datetime import timedelta
 from typing import Any, Self
 
@@ -11,13 +10,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 class TrainingProgress:
     """Prints a line for each episode and each evaluation; a terminal also shows a bar.
 
-    `steps` and `episodes` count the whole training; `step` is where it begins.
+    `steps` counts the whole training; `step` is where it begins.
     """
 
-    def __init__(
-        self, console: Console, *, steps: int, episodes: int, step: int = 0, headline: str
-    ):
-        self._console, self._headline, self._episodes = console, headline, episodes
+    def __init__(self, console: Console, headline: str, steps: int, step: int):
+        self._console, self._headline = console, headline
         self._bar = Progress(
             TextColumn("step {task.completed}/{task.total}"),
             BarColumn(bar_width=None),
@@ -28,7 +25,7 @@ class TrainingProgress:
             speed_estimate_period=120,
             disable=not console.is_terminal,
         )
-        self._task = self._bar.add_task("", total=steps, completed=step)
+        self._bar.add_task("", total=steps, completed=step)
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -37,18 +34,17 @@ class TrainingProgress:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def step(self, step: int) -> None:
-        """Updates the bar at the end of a step."""
-        self._bar.update(self._task, completed=step)
-
-    def episode(self, episode: int, line: Mapping[str, Any]) -> None:
-        """Prints the measures of an episode, and of the evaluation after it, from its line."""
-        task = self._bar.tasks[0]
+    def report(self, now: Any) -> None:
+        """Moves the bar to a `Progress`; at the end of an episode, prints its measures."""
+        (task,), line = self._bar.tasks, now.line
+        self._bar.update(task.id, completed=now.step)
+        if not line or now.step % (now.steps // now.episodes):
+            return
         pace = f", {speed:.0f} steps/s" if (speed := task.finished_speed or task.speed) else ""
         seconds = 0 if self._console.is_terminal else task.time_remaining  # the bar shows it
         left = f", {timedelta(seconds=seconds)} left" if seconds else ""
         text = (
-            f"episode {episode}/{self._episodes}: coverage {line['coverage']:.1f} %, "
+            f"episode {now.episode}/{now.episodes}: coverage {line['coverage']:.1f} %, "
             f"mean reward {line['mean_reward']:.2f}{pace}{left}"
         )
         fires = [name.partition("/")[0] for name in line if name.endswith(f"/{self._headline}")]

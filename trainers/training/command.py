@@ -7,18 +7,16 @@ from contextlib import suppress
 from rich.console import Console
 
 from emberlink.envs.scenarios import fires_of
-from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import differences, resolve
 from emberlink.trainers.evaluation.scores import print_results, reporter
 from emberlink.trainers.terminal.progress import TrainingProgress
 from emberlink.trainers.terminal.signals import Interrupted, Interruption
-from emberlink.trainers.tracking import check_installed
 from emberlink.trainers.training.resume import resume
-from emberlink.trainers.training.trainer import NonFiniteError, Progress, Trainer
+from emberlink.trainers.training.trainer import NonFiniteError, Trainer
 
 
-def train(method: str | None, overrides: Sequence[str], console: Console) -> int:
+def train(method: str, overrides: Sequence[str], console: Console) -> int:
     """Trains a method or resumes a run, and evaluates it.
 
     SIGINT, SIGTERM and SIGHUP end the training after the current step with a checkpoint; the exit
@@ -29,7 +27,10 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
     try:
         _announce(trainer, console)
         with interruption:
-            _train(trainer, console)
+            setup, headline = trainer.setup, trainer.config.evaluation.headline
+            if setup.step < setup.total_steps:
+                with TrainingProgress(console, headline, setup.total_steps, setup.step) as progress:
+                    trainer.train(progress.report)
             # The run folder stays locked during the evaluation.
             interruption.at_once = True
             if interruption.received:
@@ -40,8 +41,7 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
                 console.print(str(trainer.run.path), soft_wrap=True)
     except KeyboardInterrupt:
         with suppress(OSError):  # the terminal may be gone
-            hint = _resume_hint(trainer)
-            console.print(f"stopped; {hint}", soft_wrap=True)
+            console.print(f"stopped; {_resume_hint(trainer)}", soft_wrap=True)
         return interruption.status
     except NonFiniteError as error:
         raise UserError(f"{error}; train a new run with smaller learning rates") from None
@@ -52,25 +52,19 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
     return 0
 
 
-def _trainer(method: str | None, overrides: Sequence[str]) -> Trainer:
+def _trainer(method: str, overrides: Sequence[str]) -> Trainer:
     """Returns a new training, or the resumed training of `resume=RUN`."""
-    if method is not None and "=" in method:
-        method, overrides = None, [method, *overrides]
-    folders = [text.partition("=")[2] for text in overrides if text.startswith("resume=")]
+    words = [method, *overrides]
+    folders = [word.partition("=")[2] for word in words if word.startswith("resume=")]
     if not folders:
-        if method is None:
-            raise UserError(
-                f"{overrides[0]!r} is not a method; known: {', '.join(known('method'))}"
-            )
-        config = resolve(method, overrides)
-        check_installed(config.logger)
-        trainer = Trainer(config)
+        trainer = Trainer(resolve(method, overrides))
         trainer.start()
         return trainer
     if len(folders) > 1 or not folders[0]:
         raise UserError("resume=RUN: expected one run folder")
-    others = [text for text in overrides if not text.startswith("resume=")]
-    return resume(folders[0], method, others)
+    others = [word for word in words if not word.startswith("resume=")]
+    named = others.pop(0) if others and "=" not in others[0] else None
+    return resume(folders[0], named, others)
 
 
 def _announce(trainer: Trainer, console: Console) -> None:
@@ -78,13 +72,6 @@ def _announce(trainer: Trainer, console: Console) -> None:
     config, setup, run = trainer.config, trainer.setup, trainer.run
     if setup.step:
         console.print(f"resumed at step {setup.step} of {setup.total_steps}")
-    if trainer.changed_versions:
-        console.print(
-            f"note: the checkpoint was made with {trainer.changed_versions}: the numbers may not "
-            "be those of a run that was never stopped",
-            style="yellow",
-            soft_wrap=True,
-        )
     text = f"{config.method}, setup {config.setup}, fire {config.fire.name} -> {run.path}"
     console.print(text, soft_wrap=True)
     if read := fires_of(config.fire).summary(config.env.grid, config.env.horizon):
@@ -102,13 +89,13 @@ def _announce(trainer: Trainer, console: Console) -> None:
 
 def _notes(trainer: Trainer) -> Iterator[str]:
     """Yields notes on surprising settings of a training."""
-    config = trainer.config
-    learner = config.learner
+    if trainer.changed_versions:
+        made = f"the checkpoint was made with {trainer.changed_versions}"
+        yield f"{made}: the numbers may not be those of a run that was never stopped"
+    config, learner = trainer.config, trainer.config.learner
     starts = trainer.setup.learner.learning_starts * config.policy.hold
     if starts > trainer.setup.total_steps:
-        yield (
-            "a first batch needs more transitions than this run collects: nothing will be learnt"
-        )
+        yield "a first batch needs more transitions than this run collects: nothing will be learnt"
     if config.replay == "shared" and config.comm["name"] == "no_comm" and not learner.replays:
         yield (
             f"learner={learner.name} has no replay buffer to share: {config.method} trains as "
@@ -120,35 +107,9 @@ def _notes(trainer: Trainer) -> Iterator[str]:
         yield f"{key} is {own} here and {other} for independent: their rewards do not compare"
 
 
-def _train(trainer: Trainer, console: Console) -> None:
-    """Trains and shows the progress."""
-    setup = trainer.setup
-    if setup.step == setup.total_steps:
-        return
-    progress = TrainingProgress(
-        console,
-        steps=setup.total_steps,
-        episodes=trainer.config.episodes,
-        step=setup.step,
-        headline=trainer.config.evaluation.headline,
-    )
-
-    def report(state: Progress) -> None:
-        progress.step(state.step)
-        if state.line and state.step % trainer.config.env.horizon == 0:
-            progress.episode(state.episode, state.line)
-
-    with progress:
-        trainer.train(report)
-
-
 def _resume_command(trainer: Trainer) -> str:
     return f"emberlink train {shlex.quote(f'resume={trainer.run.path}')}"
 
 
 def _resume_hint(trainer: Trainer) -> str:
-    """Returns text about the newest checkpoint and how to resume from it."""
-    last = "there is no checkpoint"
-    if trainer.saved is not None:
-        last = f"the last good checkpoint is {trainer.run.newest}, of step {trainer.saved}"
-    return f"{last}; resume with: {_resume_command(trainer)}"
+    return f"{trainer.last_checkpoint}; resume with: {_resume_command(trainer)}"

@@ -16,10 +16,7 @@ class EpisodeRecord:
     """Records the measures and losses of an episode."""
 
     def __init__(self):
-        self.steps: list[TensorDictBase] = []
-        """measured tensors of each rollout, batch size [environments, steps]"""
-        self.losses: dict[str, list[Tensor]] = {}
-        """losses of each update by name, [uavs]"""
+        self.clear()
 
     def add(self, rollout: TensorDictBase, losses: list[Losses]) -> None:
         """Adds a rollout and the losses of the updates that followed it."""
@@ -30,29 +27,28 @@ class EpisodeRecord:
 
     def clear(self) -> None:
         """Removes all records, at the beginning of an episode."""
-        self.steps, self.losses = [], {}
+        self.steps: list[TensorDictBase] = []
+        """measured tensors of each rollout, batch size [environments, steps]"""
+        self.losses: dict[str, list[Tensor]] = {}
+        """losses of each update by name, [uavs]"""
 
     def measures(self) -> dict[str, float]:
         """Returns the episode's measures and mean losses by name."""
         episode: Any = torch.cat(cast(Any, self.steps), dim=1)
-        table = {
-            name: value.mean().item() for name, value in metrics.episode_metrics(episode).items()
-        }
+        measured = metrics.episode_metrics(episode)
         # Means over updates and UAVs.
-        losses = {name: torch.stack(self.losses[name]).mean() for name in sorted(self.losses)}
-        return table | {f"loss_{name}": value.item() for name, value in losses.items()}
+        losses = {f"loss_{name}": torch.stack(self.losses[name]) for name in sorted(self.losses)}
+        return {name: value.mean().item() for name, value in (measured | losses).items()}
 
     def state_dict(self) -> dict[str, Tensor]:
         """Returns all records by name."""
-        steps: Any = torch.cat(cast(Any, self.steps), dim=1) if self.steps else None
+        steps: Any = flatten(torch.cat(cast(Any, self.steps), dim=1)) if self.steps else {}
         losses = {name: torch.stack(values) for name, values in self.losses.items()}
-        return prefixed(steps=flatten(steps) if self.steps else {}, losses=losses)
+        return prefixed(steps=steps, losses=losses)
 
     def load_state_dict(self, state: Mapping[str, Tensor], device: torch.device | str) -> None:
         """Restores the records of `state_dict`."""
         steps = group(state, "steps")
         self.steps = [unflatten(steps, 2, device)] if steps else []
-        self.losses = {
-            name: list(values.to(device).unbind(0))
-            for name, values in group(state, "losses").items()
-        }
+        losses = group(state, "losses").items()
+        self.losses = {name: list(values.to(device).unbind(0)) for name, values in losses}

@@ -27,11 +27,7 @@ def resume(
     again. `method` must be the run's; the other arguments change keys of `MAY_CHANGE`.
     """
     run = RunFolder(path)
-    # The device of the run may not exist here, so it is replaced before it is checked.
-    devices = [text.partition("=")[2] for text in overrides if text.startswith("device=")]
-    devices += [settings["device"]] if "device" in settings else []
-    chosen: dict[str, Any] = {"device": devices[-1]} if devices else {}
-    before = run.config(**chosen)
+    before = run.config()
     if method is not None and method != before.method:
         raise UserError(f"method {method!r}: the run is of method {before.method!r}")
     config = _changed(before, overrides, settings)

@@ -15,8 +15,8 @@ from emberlink.trainers.build import make_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.setup import TrainingSetup
 
-_PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "pettingzoo", "wandb", "hydra-core")
-_GEO = ("rasterio", "geopandas", "pyogrio", "shapely", "pyproj")
+_PACKAGES = "emberlink", "torch", "torchrl", "tensordict", "pettingzoo", "wandb", "hydra-core"
+_GEO = "rasterio", "geopandas", "pyogrio", "shapely", "pyproj"
 _TINY = ("env.horizon=40", "env.num_uavs=3", "episodes=1", "num_envs=2", "learner.batch_size=32")
 
 
@@ -25,9 +25,8 @@ def doctor(console: Console) -> int:
     console.print(f"python {platform.python_version()} on {platform.platform()}")
     console.print(_versions(*_PACKAGES), soft_wrap=True)
     gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
-    console.print(
-        f"devices: cpu ({torch.get_num_threads()} threads), {', '.join(gpus) or 'no GPU'}"
-    )
+    cpu = f"cpu ({torch.get_num_threads()} threads)"
+    console.print(f"devices: {cpu}, {', '.join(gpus) or 'no GPU'}")
     console.print(f"fires from files: {_versions(*_GEO)} (extra geo)", soft_wrap=True)
     checks = {"fire": _fire} | {method: partial(_method, method) for method in known("method")}
     began, failures = time.monotonic(), 0
@@ -36,8 +35,8 @@ def doctor(console: Console) -> int:
             console.print(f"  ok      {name}: {check()}")
         except Exception as error:  # the other checks must run
             failures += 1
-            text = f"  FAILED  {name}: {type(error).__name__}: {error}"
-            console.print(text, style="red", soft_wrap=True)
+            why = f"{type(error).__name__}: {error}"
+            console.print(f"  FAILED  {name}: {why}", style="red", soft_wrap=True)
     seconds = time.monotonic() - began
     console.print(f"self-test: {failures} of {len(checks)} failed, {seconds:.1f} s")
     return int(failures > 0)

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, require
 from emberlink.policies.hold import held
 from emberlink.trainers.build import build_env, build_learner
 from emberlink.trainers.config.schema import RunConfig
@@ -111,6 +111,8 @@ def check_setup(config: RunConfig) -> None:
 
 def _make_env(config: RunConfig, num_envs: int) -> TransformedEnv:
     """Returns training environments, with the map and teacher that the learner reads."""
+    if config.logger == "tensorboard":
+        require("tensorboard", "tensorboard", "logger=tensorboard")
     config.check_rollouts()  # learners divide by the decisions of an episode
     return build_env(
         config,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from torch import Tensor
@@ -64,7 +65,6 @@ class Trainer:
         self.changed_versions = ""
         """packages with another version than in the resumed checkpoint"""
         self._lock: Lock | None = None
-        self._tracker: Tracker | None = None
         self._stopping = False
 
     def start(self) -> RunFolder:
@@ -79,14 +79,26 @@ class Trainer:
         self.run, self._lock = run, lock
         self.config = run.with_fires(self.config)
 
+    @cached_property
+    def tracker(self) -> Tracker:
+        """The tracker of the run, from the first episode or evaluation on."""
+        return Tracker(self.config, self.run)
+
+    @property
+    def last_checkpoint(self) -> str:
+        """Names the newest checkpoint, for messages."""
+        if self.saved is None:
+            return "there is no checkpoint"
+        return f"the last good checkpoint is {self.run.newest}, of step {self.saved}"
+
     def stop(self) -> None:
         """Ends the training after the current rollout; may be called from a signal handler."""
         self._stopping = True
 
     def close(self) -> None:
         """Closes the tracker and unlocks the run folder."""
-        if self._tracker is not None:
-            self._tracker.close()
+        if "tracker" in vars(self):
+            self.tracker.close()
         if self._lock is not None:
             self._lock.release()
 
@@ -106,7 +118,6 @@ class Trainer:
             UserError: a file cannot be written, such as to a full disk.
         """
         setup, line = self.setup, {}
-        self._tracker = self._tracker or Tracker(self.config, self.run)
         for rollout in setup.collector:
             before = setup.step
             self._check(setup.learn(rollout))
@@ -114,12 +125,8 @@ class Trainer:
                 line = self._finish_episode()
             if self._is_due(before, setup.step):
                 self.save()
-            report(
-                Progress(
-                    *(setup.step, setup.total_steps),
-                    *(setup.episode, self.config.episodes, line),
-                )
-            )
+            episodes = self.config.episodes
+            report(Progress(setup.step, setup.total_steps, setup.episode, episodes, line))
             if self._stopping:
                 break
         if self.saved != setup.step:
@@ -141,9 +148,8 @@ class Trainer:
             fires=config.evaluation.episodes,
             report=report,
         )
-        self._tracker = self._tracker or Tracker(config, run)
         figures = sorted((run.path / "figures").glob("*.png"))
-        self._tracker.log_evaluation(learned_means(results), figures)
+        self.tracker.log_evaluation(learned_means(results), figures)
         return results
 
     def save(self) -> None:
@@ -195,9 +201,8 @@ class Trainer:
             except NonFiniteActionError as error:
                 raise self._non_finite("an action of the validation", error.value) from None
         self._keep_best(line)
+        self.tracker.log(line)  # first, since a new tracker logs the lines before it
         self.run.append(line)
-        if self._tracker is not None:
-            self._tracker.log(line)
         return line
 
     def _keep_best(self, line: Mapping[str, Any]) -> None:
@@ -233,7 +238,5 @@ class Trainer:
 
     def _non_finite(self, name: str, value: str = "NaN or infinite") -> NonFiniteError:
         """Returns the error that ends the training; nothing has been saved since."""
-        last = "there is no checkpoint"
-        if self.saved is not None:
-            last = f"the last good checkpoint is {self.run.newest}, of step {self.saved}"
-        return NonFiniteError(f"{name} is {value} at step {self.setup.step}; {last}")
+        step = self.setup.step
+        return NonFiniteError(f"{name} is {value} at step {step}; {self.last_checkpoint}")

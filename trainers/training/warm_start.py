@@ -16,9 +16,6 @@ from emberlink.trainers.runs.pretrained import read_run
 _OBSERVED = ("comm.", "env.observation", "env.map.", "policy.hold")
 """prefixes of keys that define the meaning of observations and actions, besides `units`"""
 
-_REWARD = "comm.heading."
-"""prefix of the keys of `comm` that change rewards only"""
-
 
 def start(learner: Learner, config: RunConfig) -> None:
     """Copies the actors of the run `learner.warm_start`, of its newest checkpoint, to a learner."""
@@ -29,8 +26,7 @@ def start(learner: Learner, config: RunConfig) -> None:
     expected = {ACTOR + key: value for key, value in network.state_dict().items()}
     try:
         run = read_run(name)
-        # The device of that run may not exist here.
-        theirs = run.config(device=config.device)
+        theirs = run.config()
         weights = load_weights(run.checkpoint(), expected, config)
     except UserError as error:
         said = str(error).removeprefix(f"{name}: ")
@@ -45,7 +41,7 @@ def _warn_of_other_observations(name: str, theirs: RunConfig, mine: RunConfig) -
     more += ("env.base",) if mine.env.observation == "map" else ()  # maps show the base
     more += ("env.radio.",) if MODULES.find(mine.comm["name"]).hears else ()
     for key, (before, now) in differences(theirs, mine).items():
-        if key.startswith(_OBSERVED + more) and not key.startswith(_REWARD):
+        if key.startswith(_OBSERVED + more) and not key.startswith("comm.heading."):  # rewards
             warnings.warn(
                 f"learner.warm_start={name}: its actors were trained with {key}={shown(before)}, "
                 f"this run has {shown(now)}",

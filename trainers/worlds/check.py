@@ -122,12 +122,9 @@ def played(
 
     `fires` is the number of test or validation fires, one episode each.
     """
-    scenario, world = fires_of(config.fire), config.env
-    if split == "test":
-        arrival = scenario.test(fires, world.grid, world.horizon)
-        return play_scripted(config, policy, arrival, report=report)
-    arrival = scenario.validation(fires, world.grid, world.horizon)
-    seeds = {"start_seed": VALIDATION_START_SEED, "block": min(fires, BLOCK)}
+    arrival = fires_of(config.fire).fires(split, fires, config.env.grid, config.env.horizon)
+    of_validation = {"start_seed": VALIDATION_START_SEED, "block": min(fires, BLOCK)}
+    seeds = of_validation if split == "validation" else {}
     return play_scripted(config, policy, arrival, **seeds, report=report)
 
 

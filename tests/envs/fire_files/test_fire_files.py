@@ -38,7 +38,7 @@ def test_every_setup_accepts_a_file(source, setup):
     config = resolve("independent", [*keys, "env.grid=[12,10]"])
     assert config.fire.path == str(source)
     assert len(config.fire.sha256) == 64
-    assert fires_of(config.fire).train(GRID, HORIZON).shape == (1, *GRID)
+    assert fires_of(config.fire).fires("train", None, GRID, HORIZON).shape == (1, *GRID)
 
 
 @pytest.mark.heavy
@@ -89,9 +89,9 @@ def test_fires_are_divided_into_three_sets(count, train, validation, test, tmp_p
     fires = bank_of(count)
     np.save(tmp_path / "bank.npy", fires.numpy())
     scenario = fires_of(FileFireConfig(path=str(tmp_path / "bank.npy")))
-    assert torch.equal(scenario.train(GRID, HORIZON), fires[train])
-    assert torch.equal(scenario.validation(7, GRID, HORIZON), fires[(validation * 7)[:7]])
-    assert torch.equal(scenario.test(7, GRID, HORIZON), fires[(test * 7)[:7]])
+    assert torch.equal(scenario.fires("train", None, GRID, HORIZON), fires[train])
+    assert torch.equal(scenario.fires("validation", 7, GRID, HORIZON), fires[(validation * 7)[:7]])
+    assert torch.equal(scenario.fires("test", 7, GRID, HORIZON), fires[(test * 7)[:7]])
     # A second file holds the test fires.
     config = dataclasses.replace(scenario.config, test=str(source), units="minutes")
     sets = fire_sets(config, GRID, HORIZON)

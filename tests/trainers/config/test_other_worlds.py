@@ -63,10 +63,10 @@ def test_editions_have_their_own_test_fires():
     )]  # fmt: skip
     assert seeds == [[at, at + 1] for at in (1_000_000, 1_500_000, 1_500_000, 1_000_000)]
     here, there = (fires_of(run.fire) for run in (old, in_world(old, "relay")))
-    both = [source.test(2, (60, 60), 1000) for source in (here, there)]
+    both = [source.fires("test", 2, (60, 60), 1000) for source in (here, there)]
     assert not both[0].equal(both[1])
     assert both[1][1].equal(there.test_fire(1, (60, 60), 1000)[0])
-    valid = [source.validation(2, (60, 60), 1000) for source in (here, there)]
+    valid = [source.fires("validation", 2, (60, 60), 1000) for source in (here, there)]
     assert valid[0].equal(valid[1])
 
 

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from emberlink.envs.utils import errors
 from emberlink.envs.utils.config_files import known as known_files
 from emberlink.envs.utils.config_files import read
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.sweep.executors import base
 from emberlink.trainers.sweep.executors.base import EXECUTORS, Task, make
 from emberlink.trainers.sweep.executors.local import LocalConfig, LocalExecutor
 
@@ -24,8 +24,8 @@ def test_every_executor_has_a_file_with_its_settings():
 
 @pytest.mark.parametrize(("name", "extra"), [("submitit", "slurm"), ("ray", "ray")])
 def test_a_missing_package_is_named_with_its_extra(name, extra, monkeypatch):
-    monkeypatch.setattr(base, "find_spec", lambda _: None)
-    with pytest.raises(UserError, match=rf"{name}: not installed: pip install '\.\[{extra}\]'"):
+    monkeypatch.setattr(errors, "find_spec", lambda _: None)
+    with pytest.raises(UserError, match=rf"{name} is not installed: pip install '\.\[{extra}\]'"):
         make([f"executor={name}"])
 
 

@@ -165,7 +165,7 @@ def test_what_a_killed_process_left_is_removed(whole, tmp_path):
     assert (again.setup.step, len(run.metrics())) == (56, 2)
     left = {path.name for path in run.path.iterdir()}
     assert left == {
-        *("config.yaml", METRICS, NEWEST, BEST, "figures", "lock", "thesis.part"),
+        *("config.yaml", METRICS, NEWEST, BEST, "lock", "thesis.part"),
     }
     assert_same(whole("positional", *REPLAY), until(again, None))
 

@@ -6,14 +6,13 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
 from emberlink.envs.utils.config_files import read
-from emberlink.envs.utils.errors import UserError, how_to_install, unknown
+from emberlink.envs.utils.errors import UserError, unknown
 from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.utils.validation import from_plain
 from emberlink.trainers.config.values import check_not_removed, parse
@@ -101,9 +100,3 @@ def make(arguments: Sequence[str]) -> Executor:
         values[first] = {**values[first], rest[0]: value} if rest else value
     config: Any = from_plain(executor.config_type, values, "executor")
     return executor(config)
-
-
-def require(package: str, extra: str) -> None:
-    """Checks that the package of an executor, which has its name, is installed."""
-    if find_spec(package) is None:
-        raise UserError(f"executor={package}: not installed: {how_to_install(extra)}")

@@ -10,9 +10,9 @@ from typing import Annotated, Any
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, require
 from emberlink.envs.utils.validation import STRICT, CountOrZero
-from emberlink.trainers.sweep.executors.base import DIED, Executor, Positive, Task, require
+from emberlink.trainers.sweep.executors.base import DIED, Executor, Positive, Task
 
 _STOPPED = 128 + signal.SIGTERM
 
@@ -59,7 +59,7 @@ class RayExecutor(Executor):
     config_type = RayConfig
 
     def __init__(self, config: RayConfig):
-        require("ray", "ray")
+        require("ray", "ray", "executor=ray")
         self.workers = config.workers
         self._config = config
 

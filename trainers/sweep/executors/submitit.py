@@ -14,9 +14,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, require
 from emberlink.envs.utils.validation import STRICT, CountOrZero
-from emberlink.trainers.sweep.executors.base import DIED, Executor, Positive, Task, require
+from emberlink.trainers.sweep.executors.base import DIED, Executor, Positive, Task
 
 _MOST = 1000
 """jobs of an array in SLURM's default configuration (MaxArraySize)"""
@@ -115,7 +115,7 @@ class SubmititExecutor(Executor):
     config_type = SubmititConfig
 
     def __init__(self, config: SubmititConfig):
-        require("submitit", "slurm")
+        require("submitit", "slurm", "executor=submitit")
         # submitit starts Python with -m, which would import a random.py of the working directory.
         os.environ.setdefault("PYTHONSAFEPATH", "1")
         self.workers = min(config.workers or _MOST, _MOST)
