@@ -10,7 +10,7 @@ from rich.console import Console
 from emberlink.envs import metrics
 from emberlink.envs.utils import config_files
 from emberlink.envs.utils.atomic_io import read_bytes, user_path
-from emberlink.envs.utils.errors import UserError, naming
+from emberlink.envs.utils.errors import UserError, naming, require
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
@@ -34,40 +34,34 @@ def tune(
     same command continues, in `output/tune_METHOD_SETUP_WORLD`.
 
     Args:
-        method, overrides: see `resolve`.
         space: a file with the settings to try; the learner's file of configs/space if None.
         trials: number of trials, those of earlier commands included.
-
-    Returns:
-        0, or 128 and the number of the signal that ended it.
     """
-    try:
-        import optuna
-        from optuna.storages import JournalStorage
-        from optuna.storages.journal import JournalFileBackend
-    except ImportError:
-        raise UserError("tune needs optuna: pip install 'emberlink[tune]'") from None
+    require("optuna", "tune", "tune")
+    import optuna
+    from optuna.storages.journal import JournalFileBackend
+
     config = resolve(method, overrides)
     if not config.evaluation.interval:
         raise UserError("evaluation.interval=0: tune chooses by validations, and there are none")
     ranges = _space(config, space)
-    headline, scores = config.evaluation.headline, metrics.HIGHER_IS_BETTER
+    headline = config.evaluation.headline
     folder = user_path(config.output) / f"tune_{method}_{config.setup}_{config.world}"
     with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
+    states, journal = optuna.trial.TrialState, JournalFileBackend(str(folder / "optuna.log"))
     study = optuna.create_study(
-        storage=JournalStorage(JournalFileBackend(str(folder / "optuna.log"))),
+        storage=optuna.storages.JournalStorage(journal),
         study_name="emberlink",
-        direction="maximize" if headline in scores else "minimize",
+        direction="maximize" if headline in metrics.HIGHER_IS_BETTER else "minimize",
         sampler=optuna.samplers.TPESampler(seed=config.seed),
         load_if_exists=True,
     )
-    for old in study.get_trials(states=(optuna.trial.TrialState.RUNNING,)):
-        study.tell(old.number, state=optuna.trial.TrialState.FAIL)
+    for old in study.get_trials(states=(states.RUNNING,)):
+        study.tell(old.number, state=states.FAIL)
         study.enqueue_trial(old.params, user_attrs=old.user_attrs)
-    ended = optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED
-    while len(done := study.get_trials(states=ended)) < trials:
+    while len(done := study.get_trials(states=(states.COMPLETE, states.PRUNED))) < trials:
         trial = study.ask()
         chosen = [f"{key}={_suggest(trial, key, values)}" for key, values in ranges.items()]
         trainer = _trainer(trial, method, [*overrides, *chosen, f"output={folder}"])
@@ -91,10 +85,7 @@ def tune(
             console.print("stopped; the same command continues", soft_wrap=True)
             return interruption.status
         value = validated(trainer.run.metrics()[-1], headline)
-        if pruned:
-            study.tell(trial, state=optuna.trial.TrialState.PRUNED)
-        else:
-            study.tell(trial, value)
+        study.tell(trial, None if pruned else value, states.PRUNED if pruned else None)
         text = f"trial {len(done) + 1} of {trials}: {' '.join(chosen)}: {headline} {value:.1f}"
         console.print(text + ", stopped early" * pruned, soft_wrap=True, highlight=False)
     best = study.best_trial

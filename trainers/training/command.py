@@ -101,6 +101,8 @@ def _notes(trainer: Trainer) -> Iterator[str]:
             f"learner={learner.name} has no replay buffer to share: {config.method} trains as "
             "independent does"
         )
+    if trainer.setup.step:
+        return  # the files of the setup may have gone since
     usual = resolve("independent", [f"setup={config.setup}", f"world={config.world}"])
     rewards = {k: v for k, v in differences(config, usual).items() if k.startswith("env.reward.")}
     for key, (own, other) in rewards.items():

@@ -42,7 +42,8 @@ class EpisodeRecord:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Returns all records by name."""
-        steps: Any = flatten(torch.cat(cast(Any, self.steps), dim=1)) if self.steps else {}
+        joined: Any = torch.cat(cast(Any, self.steps), dim=1) if self.steps else None
+        steps = flatten(joined) if self.steps else {}
         losses = {name: torch.stack(values) for name, values in self.losses.items()}
         return prefixed(steps=steps, losses=losses)
 

@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -93,10 +93,9 @@ def make(arguments: Sequence[str]) -> Executor:
     executor = EXECUTORS.find(name)
     values = {key: value for key, value in read("executor", name).items() if key != "name"}
     for key, value in given.items():
-        _, first, *rest = key.split(".", 2)
-        if first not in values or (rest and not isinstance(values[first], Mapping)):
-            check_not_removed(key, value)
+        check_not_removed(key)
+        first, _, option = key.removeprefix("executor.").partition(".")
+        if first not in values:
             raise UserError(f"key {unknown(key, [f'executor.{known}' for known in values])}")
-        values[first] = {**values[first], rest[0]: value} if rest else value
-    config: Any = from_plain(executor.config_type, values, "executor")
-    return executor(config)
+        values[first] = {**(values[first] or {}), option: value} if option else value
+    return executor(from_plain(executor.config_type, values, "executor"))

@@ -32,20 +32,19 @@ class LocalExecutor(Executor):
         self._cores = (len(affinity(0)) if affinity else os.cpu_count()) or 1
         self.workers = config.workers or self._cores
         self._config, self._threads = config, config.threads
-        self._gpus: list[tuple[subprocess.Popen, int]] = []
+        self._started: list[tuple[subprocess.Popen, int | None]] = []
 
     def submit(self, tasks: Sequence[Task]) -> Sequence[subprocess.Popen]:
-        if self._threads is None:  # the first tasks are all, or as many as run at a time
-            self._threads = max(self._cores // len(tasks), 1)
+        # The first tasks are all, or as many as run at a time.
+        self._threads = self._threads or max(self._cores // len(tasks), 1)
         return [self._start(task, self._threads) for task in tasks]
 
     def _start(self, task: Task, threads: int) -> subprocess.Popen:
         """Starts a task on the GPU with the fewest tasks, if the GPUs are shared."""
-        busy = [gpu for process, gpu in self._gpus if process.poll() is None]
+        busy = [gpu for process, gpu in self._started if process.poll() is None]
         gpu = min(range(self._config.gpus or 0), key=busy.count, default=None)
         process = task.start(threads, gpu)
-        if gpu is not None:
-            self._gpus.append((process, gpu))
+        self._started.append((process, gpu))
         return process
 
     def poll(self, handle: subprocess.Popen) -> int | None:

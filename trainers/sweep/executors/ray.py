@@ -15,8 +15,6 @@ from emberlink.envs.utils.validation import STRICT, CountOrZero
 from emberlink.trainers.sweep.executors.base import DIED, Executor, Positive, Task
 
 _STOPPED = 128 + signal.SIGTERM
-
-
 Part = Annotated[float, Field(ge=0, strict=False, allow_inf_nan=False)]
 
 
