@@ -251,7 +251,8 @@ class WildfireEnv(EnvBase):
         self._time.masked_fill_(mask, 0)
         self._map.start_episodes(mask, self._draw_fire())
         if self._measures is not None:
-            self._measures.start_episodes(mask, *self._map.times)
+            counts = self._map.count(torch.zeros_like(self._time))
+            self._measures.start_episodes(mask, self._map.times[0], *counts)
         if self._fail_step is not None:
             team = self.config.num_uavs, self.config.horizon
             drawn = draw_failures(self._episode_key, self.config.failures, *team)
@@ -315,8 +316,8 @@ class WildfireEnv(EnvBase):
         told = base_seen = None
         if self._measures is not None:
             at = position, self._step_key, time, alive, burnt
-            told, base_seen = self._measures.update(look.view, look.ended, *at)
-        new, old, none = look.team.counts.unbind(-1)
+            told, base_seen = self._measures.update(look.view, look.ended, self._map.times, *at)
+        new, old, none = look.counts.unbind(-1)
         flies = self._all_alive if alive is None else alive
         penalised = self.config.reward.unseen != 0
         unseen = look.unseen.unsqueeze(-1) * flies if penalised else None

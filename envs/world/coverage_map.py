@@ -39,53 +39,39 @@ def with_burn_time(arrival: Tensor, burn_time: float) -> Tensor:
 
 
 class PassedCells(nn.Module):
-    """Finds the cells of a fire whose time has passed, or passes at a step, by binary search.
-
-    The table has one entry for each fire and step at which the time of a cell passes. Its size is
-    at most the number of cells and does not depend on the horizon.
+    """Finds the cells of a fire whose time has passed, or passes at a step.
 
     Args:
         times: arrival or burn-out times in steps, float32 [fires, cells]; inf for never, NaN for
             cells outside of the grid.
-        horizon: steps of an episode.
+        horizon: steps of an episode; later steps count as the horizon.
         listed: whether the cells themselves are stored, for `passing`.
     """
 
-    _step: Tensor
-    _total: Tensor
+    _count: Tensor
+    """int32 [fires, horizon + 2]: number of cells whose time has passed at a step"""
     _order: Tensor
+    """int32 [fires, cells]: the cells in the order of their times"""
 
     def __init__(self, times: Tensor, horizon: int, *, listed: bool = False):
         super().__init__()
-        self._horizon, self._cells = horizon, times.shape[1]
-        tables, orders = [], []
-        for first in range(0, len(times), max(1, _CHUNK // self._cells)):
-            chunk = times[first : first + max(1, _CHUNK // self._cells)]
-            step = chunk.nan_to_num(nan=math.inf).ceil().clamp(0, horizon + 1).long()
-            fire = torch.arange(first, first + len(chunk), device=times.device).unsqueeze(-1)
-            tables.append(self._entry(fire, step).unique(return_counts=True))
+        self._horizon, counts, orders = horizon, [], []
+        for part in times.split(max(1, _CHUNK // times.shape[1])):
+            step = part.nan_to_num(nan=math.inf).ceil().clamp(0, horizon + 1).long()
+            count = step.new_zeros(len(part), horizon + 2, dtype=torch.int32)
+            count.scatter_add_(1, step, torch.ones_like(step, dtype=torch.int32))
+            counts.append(count.cumsum_(1))
             orders += [step.argsort(1).int()] if listed else []
-        steps, counts = (torch.cat(parts) for parts in zip(*tables, strict=True))
-        total = torch.cat((counts.new_zeros(1), counts.cumsum(0)))
-        self.register_buffer("_step", steps, persistent=False)
-        self.register_buffer("_total", total, persistent=False)
-        if listed:
-            self.register_buffer("_order", torch.cat(orders), persistent=False)
-
-    def _entry(self, fire: Tensor, step: Tensor) -> Tensor:
-        """Returns integers that sort by fire first and by step second."""
-        return fire * (self._horizon + 2) + step
+        self.register_buffer("_count", torch.cat(counts), persistent=False)
+        self.register_buffer("_order", torch.cat(orders) if listed else None, persistent=False)
 
     def at(self, fire: Tensor, step: Tensor) -> Tensor:
-        """Returns the number of cells of a fire with `time <= step`, int64 [...].
+        """Returns the number of cells of fires with `time <= step`, int64 [...].
 
         Args:
-            fire: int64 [...], indices of fires.
-            step: int64 [...]; steps after the horizon count as the horizon.
+            fire, step: int64, broadcast against [...].
         """
-        entry = self._entry(fire, step.clamp(max=self._horizon))
-        before = torch.searchsorted(self._step, entry, right=True)
-        return self._total.take(before) - fire * self._cells
+        return self._count[fire, step.clamp(max=self._horizon)].long()
 
     def passing(self, fire: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         """Returns the cells whose time passes at a step: index into `fire` and cell, int64 [k].
@@ -98,10 +84,6 @@ class PassedCells(nn.Module):
         row = torch.arange(len(fire), device=fire.device).repeat_interleave(count)
         place = torch.arange(len(row), device=fire.device) + (first - count.cumsum(0) + count)[row]
         return row, self._order[fire[row], place].long()
-
-
-Cells = tuple[Tensor, Tensor]
-"""rows (environments) and cells of padded maps, int64 [k] each"""
 
 
 class Sighting(NamedTuple):
@@ -160,18 +142,18 @@ def mark(maps: Tensor, cells: Tensor, flags: Tensor) -> None:
 class Look(NamedTuple):
     """The sightings of the UAVs at successive steps; batch shape [steps, envs, uavs]."""
 
-    team: Sighting
-    """the cells in view by class, new fire as new to the team"""
+    counts: Tensor
+    """float64 [steps, envs, uavs, 3]: cells in view by class, new fire as new to the team"""
     shown: Sighting
-    """the same as shown to the UAVs, which differs with `own`"""
+    """what is shown to the UAVs; with `own`, new fire is what is new to the UAV"""
     view: View
     """the indices of the cells"""
     seen: Tensor
     """int64 [steps, envs]: cells that a UAV has seen while they burned"""
     unseen: Tensor
     """int64 [steps, envs]: burning cells that no UAV has seen while they burned"""
-    ended: Cells
-    """the cells that burned until a step, with the rows of the flat [steps, envs]"""
+    ended: tuple[Tensor, Tensor]
+    """the cells that burned until a step: rows of the flat [steps, envs] and cells, int64 [k]"""
 
 
 class CoverageMap(nn.Module):
@@ -321,18 +303,22 @@ class CoverageMap(nn.Module):
             burns, no_fire = burns ^ burnt_out, no_fire | burnt_out
         claims = torch.where(burns, stamp, self._never)
 
-        def sighting(first_seen: Tensor, at: Tensor) -> Sighting:
+        def new(first_seen: Tensor, at: Tensor) -> Tensor:
             first_seen.view(-1).scatter_reduce_(0, at.view(-1), claims.view(-1), "amin")
-            new = first_seen.take(at) == stamp
-            classes = torch.stack((new, burns ^ new, no_fire), -2)
-            return Sighting(*self._sensor.count_classes(classes, centre), classes, burnt_out)
+            return first_seen.take(at) == stamp
 
-        team = shown = sighting(self._first_seen, cells)
+        new_fire = shown_as_new = new(self._first_seen, cells)
         if self._own_first_seen is not None:
-            shown = sighting(self._own_first_seen, cells + self._own_first)
-        seen = self.seen_count + team.counts[..., 0].sum(-1).long().cumsum(0)
-        unseen, row = burning - seen, self._fire_index[:0]
-        ended = row, row
+            shown_as_new = new(self._own_first_seen, cells + self._own_first)
+        classes = torch.stack((shown_as_new, burns ^ shown_as_new, no_fire), -2)
+        counts, centres = self._sensor.count_classes(classes, centre)
+        shown = Sighting(counts, centres, classes, burnt_out)
+        if self._own_first_seen is not None:
+            new_count = new_fire.sum(-1, dtype=counts.dtype)
+            old_count = counts[..., :2].sum(-1) - new_count
+            counts = torch.stack((new_count, old_count, counts[..., 2]), -1)
+        seen = self.seen_count + counts[..., 0].sum(-1).long().cumsum(0)
+        unseen, ended = burning - seen, (self._fire_index[:0], self._fire_index[:0])
         if self._burnt_out is not None:
             fire = self._fire_index.expand_as(step).flatten()
             ended = row, cell = self._burnt_out.passing(fire, step.flatten())
@@ -342,4 +328,4 @@ class CoverageMap(nn.Module):
             unseen = unseen + gone
             self.seen_gone.copy_(gone[-1])
         self.seen_count.copy_(seen[-1])
-        return Look(team, shown, View(cells, in_view, burns), seen, unseen, ended)
+        return Look(counts, shown, View(cells, in_view, burns), seen, unseen, ended)

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.world import radio
-from emberlink.envs.world.coverage_map import Cells, View
+from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge, step_type
 
 _EXACT = 512
@@ -64,50 +64,63 @@ class SightingAges(nn.Module):
         for name in ("waiting", "edges"):
             self.register_buffer(name, torch.zeros(envs, len(ages), dtype=torch.int64))
 
-    def start_episodes(self, mask: Tensor, times: "FireTimes") -> None:
-        """Begins with the fires of the environments of a mask, bool [envs]."""
-        began = mask[:, None]
-        self.since.copy_(torch.where(began, times.ignition, self.since))
-        for record in (self.since_sum, self.total, self.count):
-            record.masked_fill_(mask, 0)
-        first = times.burning(torch.zeros_like(times.ignition[:, :1])).sum(-1)
-        self.burning.copy_(torch.where(mask, first, self.burning))
-        for record, at in (
-            (self.waiting, 0),
-            (self.edges, 1),
-        ):  # ages begin at step 1
-            record.masked_fill_(began, 0)
-            record[:, at] = torch.where(mask, first, record[:, at])
-
-    def add(
-        self, step: Tensor, ignited: Tensor, ended: Cells, seen: Cells, looks: Tensor | None = None
-    ) -> None:
-        """Adds the ages of a step.
+    def start_episodes(self, mask: Tensor, ignition: Tensor, burning: Tensor) -> None:
+        """Begins with new fires in the environments of a mask, bool [envs].
 
         Args:
-            step: int64 [envs], from 1 on.
-            ignited: int64 [envs], number of cells that burn since this step.
-            ended: the cells that burned until this step.
-            seen: burning cells with a new look, each once.
-            looks: int64 [k], the steps of these looks; this step if None.
+            ignition: integers [envs, area], see `whole_steps`.
+            burning: int64 [envs], number of cells that burn at step 0.
         """
-        now = step.clamp(max=self.waiting.shape[1] - 2)
-        self._count(torch.arange(len(now), device=now.device), now, now, ignited)
-        env, cell = (torch.cat(both) for both in zip(ended, seen, strict=True))
-        self._count(env, self.since[env, cell].long(), now, torch.full_like(env, -1))
-        looks = now[seen[0]] if looks is None else looks
-        self._count(seen[0], looks, now, torch.ones_like(looks))
-        self.since[seen] = looks.to(self.since.dtype)
-        self.total.add_(self.burning * now - self.since_sum)
-        self.count.add_(self.burning)
+        began = mask[:, None]
+        self.since.copy_(torch.where(began, ignition, self.since))
+        self.burning.copy_(torch.where(mask, burning, self.burning))
+        for record in (self.since_sum, self.total, self.count):
+            record.masked_fill_(mask, 0)
+        for record, at in ((self.waiting, 0), (self.edges, 1)):  # ages begin at step 1
+            record.masked_fill_(began, 0)
+            record[:, at] = torch.where(mask, burning, record[:, at])
 
-    def _count(self, env: Tensor, since: Tensor, now: Tensor, by: Tensor) -> None:
-        """Adds numbers of burning cells with a last look, and of runs that begin at their age."""
-        first = env * self.waiting.shape[1]
-        self.burning.index_add_(0, env, by)
-        self.since_sum.index_add_(0, env, by * since)
-        self.waiting.view(-1).index_add_(0, first + since, by)
-        self.edges.view(-1).index_add_(0, first + now[env] - since, by)
+    def add(
+        self, step: Tensor, ignited: Tensor, events: Tensor, looks: Tensor | None = None
+    ) -> None:
+        """Adds the ages of successive steps.
+
+        Args:
+            step: int64 [steps, envs], from 1 on.
+            ignited: int64 [steps, envs], number of cells that burn since a step.
+            events: int64 [k], from `number_events`: looks at burning cells and ends of burning.
+            looks: integers [envs, area], the steps of the looks; the step of the event if None.
+        """
+        steps, envs = step.shape
+        now = step.clamp(max=self.waiting.shape[1] - 2).flatten()
+        place, ends = events >> 1, (events & 1).bool()
+        cell = place // steps
+        env = cell // self.since.shape[1]
+        row = place % steps * envs + env
+        look = now[row] if looks is None else looks.view(-1)[cell].long()
+        # What a look or an end follows: the look before, among these steps or earlier ones.
+        before = self.since.view(-1)[cell].long()
+        again = cell[1:] == cell[:-1]
+        before[1:] = torch.where(again, look[:-1], before[1:])
+        seen = ~ends
+        look, at = look[seen], row[seen]
+        self.since.view(-1).scatter_reduce_(0, cell[seen], look.to(self.since.dtype), "amax")
+        # Runs that begin with an ignition, runs that end, and runs that begin with a look.
+        every = torch.arange(len(now), device=now.device)
+        row, since = torch.cat((every, row, at)), torch.cat((now, before, look))
+        ones = torch.ones_like(events)
+        by = torch.cat((ignited.flatten(), -ones, ones[: len(look)]))
+        env = row % envs * self.waiting.shape[1]
+        self.waiting.view(-1).index_add_(0, env + since, by)
+        self.edges.view(-1).index_add_(0, env + now[row] - since, by)
+        change = torch.zeros(2, len(now), dtype=torch.int64, device=now.device)
+        change.index_add_(1, row, torch.stack((by, by * since)))
+        total = torch.stack((self.burning, self.since_sum)).unsqueeze(1)
+        burning, since_sum = total + change.unflatten(1, (steps, envs)).cumsum(1)
+        self.total.add_((burning * now.view(steps, envs) - since_sum).sum(0))
+        self.count.add_(burning.sum(0))
+        self.burning.copy_(burning[-1])
+        self.since_sum.copy_(since_sum[-1])
 
     def mean(self) -> Tensor:
         """Returns the mean age, float32 [envs]; 0 without any ages."""
@@ -133,37 +146,20 @@ class SightingAges(nn.Module):
         return self._rounded.take((counted < rank).sum(-1)).float()
 
 
-class FireTimes(nn.Module):
-    """Stores the first step at which each cell burns and the first at which it no longer does.
+def number_events(seen: Tensor, ended: Tensor) -> Tensor:
+    """Returns looks at cells and ends of burning in the order of cells and steps, each once.
 
     Args:
-        envs: number of environments.
-        area: cells of a padded map (`Sensor.area`).
-        horizon: steps of an episode; later steps are stored as `horizon + 1`.
+        seen, ended: integers, cell * steps + step: indices of cells in the flat maps of all
+            environments, and of steps.
     """
+    return torch.cat((2 * seen, 2 * ended + 1)).unique()
 
-    ignition: Tensor
-    """integers [envs, area]"""
-    end: Tensor
-    """integers [envs, area]"""
 
-    def __init__(self, envs: int, area: int, horizon: int):
-        super().__init__()
-        self._never = horizon + 1
-        for name in ("ignition", "end"):
-            steps = torch.full((envs, area), self._never, dtype=step_type(horizon))
-            self.register_buffer(name, steps)
-
-    def start_episodes(self, mask: Tensor, arrival: Tensor, burn_out: Tensor | None) -> None:
-        """Stores new fires, steps [envs, area] (NaN outside), where a mask, bool [envs], is set."""
-        for steps, times in ((self.ignition, arrival), (self.end, burn_out)):
-            if times is not None:
-                known = times.nan_to_num(nan=self._never).clamp(0, self._never).ceil()
-                steps.copy_(torch.where(mask[:, None], known.to(steps.dtype), steps))
-
-    def burning(self, step: Tensor) -> Tensor:
-        """Returns whether each cell burns at a step, bool [envs, area]; [envs, 1]."""
-        return (self.ignition <= step) & (step < self.end)
+def whole_steps(times: Tensor, horizon: int) -> Tensor:
+    """Returns the first whole steps at or after times; `horizon + 1` for later ones and NaN."""
+    never = horizon + 1
+    return times.nan_to_num(nan=never).clamp(0, never).ceil().to(step_type(horizon))
 
 
 class Measures(nn.Module):
@@ -183,8 +179,7 @@ class Measures(nn.Module):
 
     def __init__(self, world: WildfireConfig, envs: int, area: int):
         super().__init__()
-        self._world = world
-        self.times = FireTimes(envs, area, world.horizon)
+        self._world, self._area = world, area
         self.knowledge = self.base_ages = self.ages = None
         self.register_buffer("burnt", torch.zeros(envs, dtype=torch.int64))
         if world.measures == "all":
@@ -203,13 +198,19 @@ class Measures(nn.Module):
             base = torch.tensor([[*world.base, 0.0]], dtype=torch.float64)
             self.register_buffer("_base", base.repeat(envs, 1, 1), persistent=False)
 
-    def start_episodes(self, mask: Tensor, arrival: Tensor, burn_out: Tensor | None) -> None:
-        """Starts new episodes; see `FireTimes.start_episodes`."""
-        self.times.start_episodes(mask, arrival, burn_out)
-        self.burnt.copy_(torch.where(mask, (self.times.ignition == 0).sum(-1), self.burnt))
+    def start_episodes(self, mask: Tensor, arrival: Tensor, burning: Tensor, burnt: Tensor) -> None:
+        """Starts new episodes in the environments of a mask, bool [envs].
+
+        Args:
+            arrival: float32 [envs, area], steps; NaN outside of the grid.
+            burning, burnt: int64 [envs], cells that burn, and that burn or have burnt out, at
+                step 0.
+        """
+        self.burnt.copy_(torch.where(mask, burnt, self.burnt))
         for part in (self.ages, self.base_ages):
             if part is not None:
-                part.start_episodes(mask, self.times)
+                ignition = whole_steps(arrival, self._world.horizon)
+                part.start_episodes(mask, ignition, burning)
         if self.knowledge is not None:
             self.knowledge.start_episodes(mask)
             self.base_seen.masked_fill_(mask, 0)
@@ -217,7 +218,8 @@ class Measures(nn.Module):
     def update(
         self,
         view: View,
-        ended: Cells,
+        ended: tuple[Tensor, Tensor],
+        times: tuple[Tensor, Tensor | None],
         position: Tensor,
         rng_key: Tensor,
         step: Tensor,
@@ -228,7 +230,8 @@ class Measures(nn.Module):
 
         Args:
             view: the cells in view, [steps, envs, uavs, ...].
-            ended: the cells that burned until a step, with the rows of the flat [steps, envs].
+            ended: the cells that burned until a step: rows of the flat [steps, envs] and cells.
+            times: arrival and burn-out times, float32 [envs, area]; None if cells burn for ever.
             position: float [steps, envs, uavs, 3], cells.
             rng_key: int64 [envs], `keys.RNG_KEY`.
             step: int64 [steps, envs], steps since the episode began.
@@ -243,24 +246,33 @@ class Measures(nn.Module):
         ignited = burnt.diff(dim=0, prepend=self.burnt.unsqueeze(0))
         self.burnt.copy_(burnt[-1])
         row, cell = ended
-        envs, told, known = burnt.shape[1], [], []
+        steps, envs = step.shape
+        cell = row % envs * self._area + cell
+        if self.ages is not None:
+            at = torch.arange(steps, device=step.device).view(-1, 1, 1, 1)
+            seen = (view.cells * steps + at)[view.burning]
+            events = number_events(seen, cell * steps + row // envs)
+            self.ages.add(step, ignited, events)
+        if self.knowledge is None:
+            return None, None
+        told, known = [], []
         for number, now in enumerate(step):
             looks = View(*(part[number] for part in view))
-            ends = row // envs == number
-            gone = row[ends] % envs, cell[ends]
-            if self.ages is not None:
-                seen = looks.cells[looks.burning].unique()
-                area = self.times.end.shape[1]
-                self.ages.add(now, ignited[number], gone, (seen // area, seen % area))
-            if self.knowledge is not None:
-                flies = None if alive is None else alive[number]
-                hears = self.hears(position[number].double(), rng_key, now, flies)
-                told.append(self._report(looks, now, hears, ignited[number], gone))
-                known.append(self.base_seen.clone())
-        return (torch.stack(told), torch.stack(known)) if told else (None, None)
+            flies = None if alive is None else alive[number]
+            hears = self.hears(position[number].double(), rng_key, now, flies)
+            gone = cell[row // envs == number]
+            told.append(self._report(looks, now, hears, ignited[number], gone, times))
+            known.append(self.base_seen.clone())
+        return torch.stack(told), torch.stack(known)
 
     def _report(
-        self, view: View, step: Tensor, hears: Tensor, ignited: Tensor, ended: Cells
+        self,
+        view: View,
+        step: Tensor,
+        hears: Tensor,
+        ignited: Tensor,
+        ended: Tensor,
+        times: tuple[Tensor, Tensor | None],
     ) -> Tensor:
         """Adds a step to the base's knowledge; returns the burnt cells that it is told."""
         knowledge, ages = self.knowledge, self.base_ages
@@ -269,12 +281,13 @@ class Measures(nn.Module):
         assert knowledge.seen_fire is not None
         before = knowledge.last_seen[:, -1].clone()
         knowledge.update(view, step, hears)
-        after = knowledge.last_seen[:, -1]
-        env, cell = (after > before).nonzero(as_tuple=True)
-        looks = after[env, cell]
-        burns = self.times.burning(step.to(looks.dtype).unsqueeze(-1))[env, cell]
-        newer = burns & (looks > ages.since[env, cell])
-        ages.add(step, ignited, ended, (env[newer], cell[newer]), looks[newer].long())
+        after, now = knowledge.last_seen[:, -1].clone(), step.unsqueeze(-1)
+        arrival, burn_out = times
+        newer = (after > before) & (after > ages.since) & (arrival <= now)
+        if burn_out is not None:
+            newer &= now < burn_out
+        events = number_events(newer.view(-1).nonzero().squeeze(-1), ended)
+        ages.add(step[None], ignited[None], events, after)
         seen = knowledge.seen_fire[:, -1].sum(-1)
         told = (seen - self.base_seen).unsqueeze(-1) * knowledge.reach[:, -1, :-1]
         self.base_seen.copy_(seen)

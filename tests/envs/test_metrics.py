@@ -8,10 +8,13 @@ from emberlink.trainers import make_env
 
 
 def test_what_the_base_knows_is_averaged_over_steps():
-    seen, burnt = torch.tensor([0, 0, 10, 30]), torch.tensor([20, 40, 40, 40])
-    assert metrics.base_coverage(seen, burnt).item() == 75
+    steps = {
+        keys.BASE_SEEN: torch.tensor([0, 0, 10, 30]),
+        keys.BURNT: torch.tensor([20, 40, 40, 40]),
+    }
+    assert metrics.base_coverage(steps).item() == 75
     # 0, 0, 25 and 75 %: coming home at the last moment counts for a quarter of the time
-    assert metrics.base_coverage_auc(seen, burnt).item() == 25
+    assert metrics.base_coverage_auc(steps).item() == 25
 
 
 @pytest.mark.parametrize(
@@ -25,13 +28,14 @@ def test_what_the_base_knows_is_averaged_over_steps():
     ],
 )
 def test_coverage_time(seen, burning, time):
-    assert metrics.time_to_full_coverage(torch.tensor(seen), torch.tensor(burning)).item() == time
+    steps = {keys.SEEN: torch.tensor(seen), keys.BURNT: torch.tensor(burning)}
+    assert metrics.time_to_full_coverage(steps).item() == time
 
 
 def test_coverage_without_fire_is_complete():
-    nothing = torch.zeros(3, dtype=torch.int64)
-    assert metrics.coverage(nothing, nothing).item() == 100
-    assert metrics.coverage_auc(nothing, nothing).item() == 100
+    steps = dict.fromkeys((keys.SEEN, keys.BURNT), torch.zeros(3, dtype=torch.int64))
+    assert metrics.coverage(steps).item() == 100
+    assert metrics.coverage_auc(steps).item() == 100
 
 
 def by_hand(steps) -> dict[str, float]:
@@ -82,4 +86,6 @@ def test_episode_metrics_equal_loops(method):
 
 
 def test_bytes_per_step_by_hand():
-    assert metrics.bytes_per_step(torch.tensor([[[16, 0], [32, 16]]])).tolist() == [16]
+    assert metrics.bytes_per_step(
+        {keys.BYTES_SENT: torch.tensor([[[16, 0], [32, 16]]])}
+    ).tolist() == [16]

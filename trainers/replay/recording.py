@@ -15,7 +15,7 @@ from emberlink.envs.config import WildfireConfig
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import radio
 from emberlink.envs.world.coverage_map import View
-from emberlink.envs.world.measures import Measures
+from emberlink.envs.world.measures import Measures, whole_steps
 from emberlink.envs.world.sensor import Sensor
 
 COUNTS = {"seen": keys.SEEN, "burning": keys.BURNING, "burnt": keys.BURNT}
@@ -125,8 +125,7 @@ class Recorder:
 
     def recording(self) -> Recording:
         """Returns the recorded episode."""
-        crop, times = self._sensor.crop, self._measures.times
-        ignition, end = crop(times.ignition)[0].numpy(), crop(times.end)[0].numpy()
+        ignition, end = (self._sensor.crop(steps)[0].numpy() for steps in self._whole)
         steps = {name: np.stack(values) for name, values in self._steps.items()}
         listens = self._hears or self._config.base is not None
         return Recording(
@@ -139,11 +138,15 @@ class Recorder:
         measured = dataclasses.replace(world.config, measures="all")
         self._measures = Measures(measured, 1, self._sensor.area)
         member, burn_out = [self._member], world.burn_out
-        self._measures.start_episodes(
-            torch.ones(1, dtype=torch.bool),
-            self._sensor.pad(world.arrival_time[member].cpu(), torch.nan),
-            None if burn_out is None else self._sensor.pad(burn_out[member].cpu(), torch.nan),
-        )
+        arrival = self._sensor.pad(world.arrival_time[member].cpu(), torch.nan)
+        end = None if burn_out is None else self._sensor.pad(burn_out[member].cpu(), torch.nan)
+        self._times, never = (arrival, end), torch.full_like(arrival, torch.inf)
+        self._whole = [
+            whole_steps(times, world.config.horizon)
+            for times in (arrival, never if end is None else end)
+        ]
+        counts = self._burning(torch.zeros(1)).sum(-1), (self._whole[0] == 0).sum(-1)
+        self._measures.start_episodes(torch.ones(1, dtype=torch.bool), arrival, *counts)
         base = world.config.base
         self._base = torch.zeros(1, 0, 3) if base is None else torch.tensor([[[*base, 0.0]]])
 
@@ -155,11 +158,11 @@ class Recorder:
         whole = self._sensor.look(position, start)[2] & alive.unsqueeze(-1)
         view = self._view(position, alive, key, step)
         if step > 0:  # nobody looks at the reset
-            times = self._measures.times
-            burnt, ended = (times.ignition <= step).sum(-1), (times.end == step).nonzero().unbind(1)
+            ignition, end = self._whole
+            burnt, (row, cell) = (ignition <= step).sum(-1), (end == step).nonzero().unbind(1)
             seen = View(*(part.unsqueeze(0) for part in view))
             at = position[None], key, step[None], alive[None], burnt[None]
-            self._measures.update(seen, (ended[0], ended[1]), *at)
+            self._measures.update(seen, (row, cell), self._times, *at)
         else:
             whole.zero_()
         if self._config.base is None:
@@ -182,7 +185,11 @@ class Recorder:
         start = torch.zeros(1, 1, dtype=torch.int64)
         _, cells, in_view = self._sensor.look(position, start, key, step)
         in_view &= alive.unsqueeze(-1)
-        return View(cells, in_view, in_view & self._measures.times.burning(step)[0].take(cells))
+        return View(cells, in_view, in_view & self._burning(step)[0].take(cells))
+
+    def _burning(self, step: Tensor) -> Tensor:
+        ignition, end = self._whole
+        return (ignition <= step) & (step < end)
 
     def _on_map(self, view: View) -> Tensor:
         """Returns the cells in view on the map, bool [n, X, Y]."""
