@@ -8,7 +8,7 @@ RMRS-RP-4). The same front is the zero contour of φ with
 
 where w is the unit vector of the direction of maximum spread, (a, b, c) the rates at which the
 wavelet's half length and half breadth grow and its centre moves, u the drift of the medium (none
-for fire, the current for oil on water), and m ≥ 0 a multiplier in space (fuel; 0 is a barrier).
+for fire, the current for oil on water), and m > 0 a multiplier in space (fuel).
 Space is discretised by upwind differences limited by superbee (Roe 1986, Annu. Rev. Fluid Mech.
 18), time by Heun's method at a Courant number of 0.4.
 
@@ -19,15 +19,12 @@ direction in which the head moves (not the direction from which a wind comes).
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from emberlink.envs.utils.errors import UserError
-
 Varying = Tensor | Callable[[float], Tensor]
-"""A value per fire, [fires] (a drift: [fires, 2]), or a function from the time in steps to one."""
+"""A value per fire, [fires] (a drift: [fires, 2]), or a function of the time in steps."""
 
 Distance = Callable[[Tensor, Tensor], Tensor]
 """From x [1, NX, 1] and y [1, 1, NY] to the signed distance [fires, NX, NY], negative inside."""
@@ -37,22 +34,6 @@ _PAD = 2  # cells around the grid, so that the ends of the stencil lie outside o
 
 
 MAX_LENGTH_TO_BREADTH = 8.0
-
-
-def length_to_breadth(wind: float | Tensor) -> Tensor:
-    """Returns the length-to-breadth ratio of a wildfire in wind (Anderson 1983, USDA INT-305).
-
-    Args:
-        wind: mid-flame wind speed in m/s, not negative, any shape.
-
-    Returns:
-        0.936 exp(0.2566 U) + 0.461 exp(−0.1548 U) − 0.397, at most 8, in the shape of `wind`.
-    """
-    speed = torch.as_tensor(wind)
-    if (speed < 0).any():
-        raise UserError(f"wind speed must not be negative, got {speed.min().item()}")
-    ratio = 0.936 * torch.exp(0.2566 * speed) + 0.461 * torch.exp(-0.1548 * speed) - 0.397
-    return ratio.clamp(1.0, MAX_LENGTH_TO_BREADTH)
 
 
 def ellipse_rates(
@@ -69,8 +50,6 @@ def ellipse_rates(
         (a, b, c): growth of the half length, of the half breadth, and speed of the centre.
     """
     head, ratio = torch.as_tensor(head_ros), torch.as_tensor(length_to_breadth)
-    if (ratio < 1).any():
-        raise UserError(f"length_to_breadth must be at least 1, got {ratio.min().item()}")
     if two_sided:
         return head, head / ratio, torch.zeros_like(head)
     eccentricity = torch.sqrt(ratio**2 - 1) / ratio
@@ -92,8 +71,8 @@ def disc(centre: Tensor, radius: Tensor) -> Distance:
 def arrival_times(
     distance: Distance,
     grid: tuple[int, int],
-    head_ros: Varying,
-    length_to_breadth: Varying,
+    head_ros: Tensor,
+    length_to_breadth: Tensor,
     azimuth: Varying,
     *,
     horizon: float,
@@ -115,10 +94,9 @@ def arrival_times(
         drift: velocity of the medium, cells per step. The first arrival at a cell counts.
         margin: cells around the grid that are computed too; a drift can carry the front back.
         refine: nodes per cell and axis.
-        rate_field: multiplier of all rates, [fires, X, Y] or [1, X, Y], linear in between. A cell
-            with 0 never burns and lets nothing through.
-        max_rate: upper bound of (head rate + speed of the drift) · multiplier, cells per step;
-            needed if `head_ros` or `drift` is a function.
+        rate_field: multiplier of all rates, [fires, X, Y] or [1, X, Y], linear in between.
+        max_rate: upper bound of (head rate + speed of the drift) · multiplier, cells per step; by
+            default of the head rate and the multiplier, without a drift.
         max_step: upper bound of a time step, for functions that vary faster than the front moves.
         device: of the computation.
 
@@ -128,48 +106,25 @@ def arrival_times(
     pad = _PAD + margin
     x, y = (_nodes(cells, pad, refine, device) for cells in grid)
     phi = distance(x[None, :, None], y[None, None, :])
-    rates = None if rate_field is None else _refined(rate_field.to(phi), grid, x, y)
-    step = COURANT / refine / max(_rate_bound(head_ros, drift, rates, max_rate), 1e-12)
-    wave = _Wave(head_ros, length_to_breadth, azimuth, two_sided, drift, rates, refine)
-    return _march(phi, wave, pad * refine, horizon, min(step, max_step))
+    rates = torch.ones(()) if rate_field is None else _refined(rate_field.to(phi), grid, x, y)
+    wavelet = ellipse_rates(head_ros.to(phi), length_to_breadth.to(phi), two_sided)
+    if max_rate is None:
+        max_rate = float(head_ros.max() * rates.max())
+    step = min(COURANT / refine / max(max_rate, 1e-12), max_step)
 
-
-class _Wave(NamedTuple):
-    """The rates of a front on the fine nodes."""
-
-    head_ros: Varying
-    length_to_breadth: Varying
-    azimuth: Varying
-    two_sided: bool
-    drift: Varying | None
-    rates: Tensor | None
-    """multiplier of the rates at the nodes"""
-    refine: int
-    """nodes per cell and axis"""
-
-    def decay(self, phi: Tensor, time: float) -> Tensor:
+    def decay(phi: Tensor, time: float) -> Tensor:
         """Returns −φ_t at a time."""
+        towards = azimuth(time) if callable(azimuth) else azimuth
+        medium = drift(time) if callable(drift) else drift
+        decayed = _hamiltonian(phi * refine, wavelet, towards, medium)
+        return decayed if rate_field is None else decayed * rates
 
-        def now(value: Varying) -> Tensor:
-            return (value(time) if callable(value) else value).to(phi)
-
-        wavelet = ellipse_rates(now(self.head_ros), now(self.length_to_breadth), self.two_sided)
-        drift = None if self.drift is None else now(self.drift)
-        decay = _hamiltonian(phi * self.refine, wavelet, now(self.azimuth), drift)
-        return decay if self.rates is None else decay * self.rates
-
-
-def _march(phi: Tensor, wave: _Wave, border: int, horizon: float, step: float) -> Tensor:
-    """Returns the arrival times at the cells of a level set advanced by Heun's method (RK2)."""
-    inner = slice(border, -border, wave.refine)
+    inner = slice(pad * refine, -pad * refine, refine)
     cells = (slice(None), inner, inner)
-    blocked = torch.zeros_like(phi[cells], dtype=torch.bool)
-    if wave.rates is not None:
-        blocked = blocked | (wave.rates[cells] <= 0)
-    arrival = torch.where((phi[cells] <= 0) & ~blocked, 0.0, math.inf).to(phi)
-    for k in range(math.ceil(min(horizon / step, 1e9))):
-        first = wave.decay(phi, k * step)
-        second = wave.decay(phi - step * first, (k + 1) * step)
+    arrival = torch.where(phi[cells] <= 0, 0.0, math.inf).to(phi)
+    for k in range(math.ceil(horizon / step)):  # Heun's method (RK2)
+        first = decay(phi, k * step)
+        second = decay(phi - step * first, (k + 1) * step)
         new = phi - step / 2 * (first + second)
         old, now = phi[cells], new[cells]
         crossed = (old > 0) & (now <= 0) & arrival.isinf()
@@ -184,38 +139,18 @@ def _nodes(cells: int, pad: int, refine: int, device: torch.device | str | None)
     return torch.arange(count, device=device, dtype=torch.float32) / refine - pad
 
 
-def _rate_bound(
-    head_ros: Varying, drift: Varying | None, rates: Tensor | None, max_rate: float | None
-) -> float:
-    if max_rate is not None:
-        return max_rate
-    still = drift is None
-    if not isinstance(head_ros, Tensor) or not (still or isinstance(drift, Tensor)):
-        which = "drift" if isinstance(head_ros, Tensor) else "head_ros"
-        raise UserError(f"max_rate is needed when {which} is a function, got None")
-    fastest = float(head_ros.max() if still else (head_ros + drift.norm(dim=1)).max())
-    return fastest * (1.0 if rates is None else max(float(rates.max()), 0.0))
-
-
 def _refined(field: Tensor, grid: tuple[int, int], x: Tensor, y: Tensor) -> Tensor:
-    """Returns the multiplier at the nodes: bilinear, 0 on barriers, their edges and corners."""
-    free = (field > 0).to(field)
+    """Returns the multiplier at the nodes, bilinear between cells."""
     u, v = x.clamp(0, grid[0] - 1), y.clamp(0, grid[1] - 1)
+    along_x, along_y = (u - u.floor())[:, None], v - v.floor()
 
-    def at(values: Tensor, i: Tensor, j: Tensor) -> Tensor:
-        return values[:, i.long()][:, :, j.long()]
+    def at(i: Tensor, j: Tensor) -> Tensor:
+        return field[:, i.long()][:, :, j.long()]
 
-    def between(values: Tensor) -> Tensor:
-        along_x, along_y = (u - u.floor())[:, None], v - v.floor()
-        low = torch.lerp(at(values, u.floor(), v.floor()), at(values, u.ceil(), v.floor()), along_x)
-        high = torch.lerp(at(values, u.floor(), v.ceil()), at(values, u.ceil(), v.ceil()), along_x)
-        return torch.lerp(low, high, along_y)
-
-    smooth = between(field) / between(free).clamp_min(1e-6)
-    for i in ((u - 0.5).ceil(), (u + 0.5).floor()):
-        for j in ((v - 0.5).ceil(), (v + 0.5).floor()):
-            smooth = smooth * at(free, i, j)
-    return smooth
+    low, high = (
+        torch.lerp(at(u.floor(), j), at(u.ceil(), j), along_x) for j in (v.floor(), v.ceil())
+    )
+    return torch.lerp(low, high, along_y)
 
 
 def _hamiltonian(

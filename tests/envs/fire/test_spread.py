@@ -8,7 +8,7 @@ import torch
 from exact_front import exact_arrival, support
 from torch import Tensor
 
-from emberlink.envs.fire.level_set import arrival_times, disc, ellipse_rates, length_to_breadth
+from emberlink.envs.fire.level_set import arrival_times, disc, ellipse_rates
 
 SIDE, CORE, HEAD, HORIZON = 30.0, 3.0, 0.01, 1000.0
 STRAIGHT, TURNING = 0.0, math.pi
@@ -49,21 +49,10 @@ def grow(grid=(24, 24), centre=(11.0, 11.0), radius=3.0, head=0.006, ratio=2.5, 
     return arrival_times(start, grid, *args, **k)[0]
 
 
-def test_length_to_breadth_by_hand():
-    got = length_to_breadth(torch.tensor([0.0, 2.0, 5.0, 20.0]).double())
-    want = torch.tensor([1.0, 1.563707 + 0.338253 - 0.397, 3.376569 + 0.212598 - 0.397, 8.0])
-    torch.testing.assert_close(got, want.double(), atol=2e-5, rtol=0)
-    assert length_to_breadth(0.0).shape == ()
-    with pytest.raises(ValueError, match="-1"):
-        length_to_breadth(-1.0)
-
-
 def test_ellipse_rates_by_hand():
     a, b, c = ellipse_rates(1.0, 2.0)  # e = 0.866025, R_back = 0.071797
     torch.testing.assert_close(torch.stack([a, b, c]), torch.tensor([0.535898, 0.267949, 0.464102]))
     assert [float(r) for r in ellipse_rates(0.5, 1.0)] == [0.5, 0.5, 0.0]
-    with pytest.raises(ValueError, match=r"0\.5"):
-        ellipse_rates(1.0, 0.5)
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1.5, 4.0])
@@ -107,9 +96,8 @@ def test_a_straight_front_moves_at_its_speed():
     torch.testing.assert_close(got, want, rtol=1e-4, atol=0.01)
 
 
-def test_symmetry_with_fuel_and_barriers():
+def test_symmetry_with_fuel():
     field = torch.rand(1, 24, 24, generator=torch.Generator().manual_seed(5))
-    field[0, 16:19, 8:11] = 0
     even = {"centre": (11.5, 11.5), "ratio": 1.0, "head": 0.02}
     base = grow(rate_field=field, **even)
     for axes in ((0,), (1,), (0, 1)):
@@ -132,69 +120,10 @@ def test_arrival_never_decreases_outwards():
     assert (around.flatten(2).amin(2) < patchy)[later].all()
 
 
-def wall(kind: str) -> tuple[Tensor, Tensor]:
-    """Returns the barrier cells and the cells behind them, bool [24, 24]."""
-    x, y = torch.meshgrid(torch.arange(24), torch.arange(24), indexing="ij")
-    if kind == "straight":
-        return x == 16, x > 16
-    if kind == "diagonal":  # cells touch at corners only
-        return x + y == 29, x + y > 29
-    ring = torch.maximum((x - 11).abs(), (y - 11).abs())
-    return ring == 5, ring > 5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["straight", "diagonal", "ring"])
-@pytest.mark.parametrize("refine", [1, 2, 3, 4])
-def test_a_barrier_one_cell_wide_never_burns_and_does_not_leak(kind: str, refine: int):
-    barrier, behind = wall(kind)
-    field = (~barrier).float()[None]
-    options = {"head": 0.02, "azimuth": 0.6, "refine": refine, "horizon": 2000}
-    got = grow(rate_field=field, **options)
-    assert got[barrier | behind].isinf().all()
-    assert grow(**options)[behind].isfinite().any()
-    assert got[~barrier & ~behind].isfinite().sum() > 60
-
-
-def test_the_front_goes_around_a_barrier():
-    """Compares with the shortest path, which passes the two upper corners of the wall."""
-    barrier, _ = wall("straight")
-    barrier[:, 15:] = False
-    options = {"head": 0.02, "ratio": 1.0}
-    got = grow(rate_field=(~barrier).float()[None], refine=8, **options)
-    to_wall = math.hypot(15.5 - 11, 14.5 - 11) - 3.0
-    for x, y in ((17, 11), (20, 12)):
-        path = to_wall + 1 + math.hypot(x - 16.5, y - 14.5)
-        assert 1 < float(got[x, y]) * 0.02 / path < 1.08
-    free = grow(**options)
-    assert free[17, 11] < 160
-    # The arrival in front of the wall does not change.
-    early = (slice(12, 15), slice(8, 14))
-    coarse = grow(rate_field=(~barrier).float()[None], **options)
-    torch.testing.assert_close(coarse[early], free[early], rtol=0, atol=0.3)
-
-
-def test_a_barrier_inside_the_initial_front_does_not_burn():
-    field = torch.ones(1, 24, 24)
-    field[0, 11, 11] = 0
-    got = grow(rate_field=field)
-    assert got[11, 11].isinf()
-    assert got[12, 12] == 0
-
-
-def test_rates_in_space_and_time():
+def test_half_the_rate_everywhere_is_half_the_speed():
     half = torch.full((1, 24, 24), 0.5)
     same = grow(rate_field=half, head=0.012, max_rate=0.012)
     torch.testing.assert_close(same, grow(head=0.006, max_rate=0.012), rtol=0, atol=0.01)
-    start = disc(torch.tensor([[11.0, 11.0]]), torch.tensor([3.0]))
-    ramp = lambda time: torch.tensor([0.012 * time / 1000])  # noqa: E731
-    more = torch.tensor([2.5]), torch.tensor([0.4])
-    got = arrival_times(start, (24, 24), ramp, *more, horizon=1000, max_rate=0.012)[0]
-    steady = grow(head=0.006)  # the same path at another speed: t² / 1000
-    want = (steady * 1000).sqrt()
-    finite = got.isfinite() & want.isfinite()
-    assert finite.sum() > 60
-    torch.testing.assert_close(got[finite], want[finite], rtol=0.005, atol=3)
 
 
 def test_the_edge_of_the_grid_has_no_effect():
