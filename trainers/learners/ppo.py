@@ -149,6 +149,8 @@ class PPO(Learner, ABC):
         weights = [*self.parts[0], *self.parts[1]]
         self.optimizer = torch.optim.Adam(weights, lr=config.lr, eps=1e-5, fused=True)
         self.learning_starts = context.horizon
+        # Several decisions at once cost less; those of an episode would fill the memory twice.
+        self.rollout_steps = max(n for n in range(1, 11) if context.horizon % n == 0)
         self.decisions = 0
         """decisions so far, in the whole run"""
         self._episode: list[TensorDictBase] = []
@@ -239,10 +241,10 @@ class PPO(Learner, ABC):
         """Returns the learner's tensors of a rollout, batch size [environments, steps]."""
         read = [*self.actor.observed, *self.critic.in_keys[1:], keys.ACTION, LOG_PROB]
         read += self.actor.carries  # the state of the memory before the decision
-        result = {key: rollout.get(key).clone() for key in read}
-        result[keys.REWARD] = rollout.get(("next", *keys.REWARD)).clone()
+        result = {key: rollout.get(key) for key in read}
+        result[keys.REWARD] = rollout.get(("next", *keys.REWARD))
         if self.context.failures:
-            result[keys.ALIVE] = rollout.get(("next", *keys.ALIVE)).clone()
+            result[keys.ALIVE] = rollout.get(("next", *keys.ALIVE))
         return TensorDict(result, batch_size=rollout.shape, device=rollout.device)
 
     def _estimate(self, episode: TensorDictBase, last: TensorDictBase) -> Tensor:

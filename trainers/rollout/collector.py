@@ -42,12 +42,14 @@ class ResumableCollector:
             policy,
             frames_per_batch=env.batch_size.numel() * rollout,
             total_frames=-1,  # `made` counts, from where the run was resumed
+            use_buffers=False,  # a rollout is the caller's, and needs no copy
+            return_same_td=True,
             trust_policy=True,
             track_traj_ids=False,
             auto_register_policy_transforms=False,
         )
-        self.carried = self._resets.last
-        """the input of the next decision"""
+        self._last: Any = None
+        """the last time step of the last rollout"""
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         """Yields rollouts, batch size [environments, rollout]."""
@@ -55,20 +57,23 @@ class ResumableCollector:
         while self.made < self.decisions:
             rollout = next(rollouts)
             self.made += self.rollout
-            last: Any = rollout[:, -1]
-            ended = bool(last["next", "done"].any())  # all environments end together
-            self.carried = self._resets.last if ended else self._input_after(last)
+            self._last = rollout[:, -1]
             yield rollout
+
+    @property
+    def carried(self) -> TensorDictBase:
+        """The input of the next decision, between two rollouts."""
+        first = self._resets.last
+        if self._last is None or self._last["next", "done"].any():  # all environments end together
+            return first
+        following: Any = step_mdp(self._last)
+        return following.select(*first.keys(True, True))
 
     def restore(self, carried: TensorDictBase, made: int) -> None:
         """Continues from an earlier value of `carried`, after some decisions of the run."""
-        self._resets.instead = self.carried = carried
+        self._resets.instead = carried
         self._collector.reset()
-        self.made = made
-
-    def _input_after(self, last: TensorDictBase) -> TensorDictBase:
-        following: Any = step_mdp(last)
-        return following.select(*self._resets.last.keys(True, True)).clone()
+        self._last, self.made = None, made
 
 
 class _Resets(Transform):

@@ -1,7 +1,7 @@
 """Tests the learners from whole episodes: IPPO and MAPPO."""
 
 import math
-from itertools import combinations, islice
+from itertools import combinations
 from typing import Any
 
 import pytest
@@ -153,12 +153,12 @@ def test_uavs_without_shared_weights_learn_alone():
 def test_only_mappos_critic_reads_the_true_map():
     """The map is the environment's before each decision; evaluations do not have it."""
     setup = made("mappo", "learner.critic_map=true", "env.grid=[12,9]")
-    maps = [setup.env.base_env.fire_map.clone()]
-    for rollout in islice(setup.collector, 6):
-        assert rollout[keys.TRUE_MAP][:, 0].equal(maps[-1])
-        maps.append(rollout["next", keys.TRUE_MAP][:, -1])
-    assert maps[-1].shape == (4, 12, 9)
-    assert maps[-1].any()
+    first, rollout = setup.env.base_env.fire_map.clone(), next(iter(setup.collector))
+    maps, after = rollout[keys.TRUE_MAP], rollout["next", keys.TRUE_MAP]
+    assert maps.shape == (4, setup.learner.rollout_steps, 12, 9)
+    assert maps[:, 0].equal(first)
+    assert maps[:, 1:].equal(after[:, :-1])
+    assert after[:, -1].any()
     learner: Any = setup.learner
     assert keys.TRUE_MAP in learner.critic.in_keys
     assert keys.TRUE_MAP not in learner.explorer.in_keys
