@@ -22,7 +22,7 @@ PIP := $(BIN)/python -m pip install -q --no-compile --disable-pip-version-check 
 export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-cluster test-clients soak bench guard lint typecheck docs install browser clean
+.PHONY: help demo test test-slow test-cluster test-clients soak bench guard lint typecheck docs tables install browser clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -83,6 +83,9 @@ typecheck: $(INSTALLED)  ## check the types
 docs: $(INSTALLED) docs/replay.html  ## build the documentation site in build/docs; warnings are errors (about 2 minutes)
 	@OMP_NUM_THREADS=1 $(BIN)/sphinx-build -q -W -E -b html docs build/docs
 	@echo "build/docs/index.html"
+
+tables: $(INSTALLED)  ## write the tables of the pages from docs/data
+	@$(BIN)/python docs/experiments/tables.py
 
 docs/replay.html: | $(INSTALLED)
 	@$(BIN)/emberlink render pretrained:consensus pretrained:consensus env.radio.range=0 --fire huygens:2 --output $@

@@ -146,9 +146,7 @@ def different(commands: list[str]) -> list[str]:
     return list({tuple(shortened(shlex.split(c)[1:])): c for c in reversed(commands)}.values())
 
 
-LONG = re.compile(
-    "emberlink (compare (docs/data|pretrained)|world check|eval pretrained:maps world|doctor)"
-)
+LONG = re.compile("emberlink (compare pretrained|world check|eval pretrained:maps world|doctor)")
 """beginnings of commands that take long"""
 
 

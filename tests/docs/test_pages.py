@@ -6,6 +6,7 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
+import tables
 import yaml
 from fire_files import Ellipses, raster_of, write_asc
 
@@ -50,6 +51,16 @@ def test_a_command_stands_beside_each_figure():
             for file in FIGURE.findall(block) if page.parent != ROOT else []:
                 assert (page.parent / file).is_file()
                 assert re.match(r"Made with `(emberlink|python) [^`]+`", after), file
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "page",
+    [page for page, text in TEXTS.items() if "<!-- table: " in text],
+    ids=lambda page: page.stem,
+)
+def test_tables_are_those_of_the_data(page):
+    assert tables.written(TEXTS[page]) == TEXTS[page]
 
 
 @pytest.mark.slow

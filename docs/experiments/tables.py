@@ -1,0 +1,147 @@
+"""Writes the tables between markers on the pages from docs/data.
+
+    python docs/experiments/tables.py                        # make tables
+    python docs/experiments/tables.py pack NAME LABEL=RUNS…  # makes the files of a study
+
+`<!-- table: NAME -->` names a table of tables.yaml. A cell is an expression, its row in the place
+of `{}` in its column or the other way round: function, runs, measure and number of digits, such as
+`iqm front/maps coverage 1`.
+"""
+
+import json
+import re
+import sys
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from emberlink.envs import metrics
+from emberlink.trainers.comparison import bootstrap
+
+ROOT = Path(__file__).parents[2]
+DATA = ROOT / "docs" / "data"
+TABLE = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
+POINTS = 40  # most of a learning curve: means of equal parts of a training
+
+
+def written(text: str) -> str:
+    """Returns the text of a page with its tables as the data have them."""
+    known = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
+    return TABLE.sub(lambda found: f"{found[1]}{table(**known[found[2]])}{found[3]}", text)
+
+
+def table(columns: dict[str, str], rows: dict[str, Any], first: str = "") -> str:
+    """Returns a table; `first` is the head of the names of rows, and a list holds texts."""
+    lines = [[first, *columns], ["---"] * (len(columns) + first.count("|") + 1)]
+    for name, row in rows.items():
+        cells = row if isinstance(row, list) else [cell(row, c) for c in columns.values()]
+        lines.append([name.rstrip(), *cells])
+    return "".join(f"| {' | '.join(line)} |\n".replace("|  |", "| |") for line in lines)
+
+
+def cell(row: str, column: str) -> str:
+    """Returns the text of an expression; empty if its first run does not exist."""
+    expression = row.replace("{}", column) if "{}" in row else column.replace("{}", row)
+    function, *runs, measure, digits = expression.split()
+    samples = [sample(*run.split("/"), measure) for run in runs]
+    if not len(samples[0]):
+        return ""
+    value, ends = FUNCTIONS[function](samples, measure)
+    texts = [f"{x:,.{digits}f}".replace("-", "\N{MINUS SIGN}") for x in (value, *(ends or ()))]
+    return f"{texts[0]} [{texts[1]}, {texts[2]}]" if ends and ends[0] < ends[1] else texts[0]
+
+
+@cache
+def frame(name: str) -> dict[Any, Any]:
+    data = pd.read_csv(DATA / f"{name}.csv.xz").rename(columns={"episode": "fire"})
+    return dict(iter(data.fillna({"seed": -1}).groupby(["run", "measure"])))
+
+
+def sample(study: str, run: str, measure: str) -> Any:
+    """Returns the values of a run, [seeds, fires], or [seeds, points] of its learning curve."""
+    rows = frame(study).get((run, measure))
+    return (
+        [] if rows is None else rows.pivot(index="seed", columns="fire", values="value").to_numpy()
+    )
+
+
+def iqm(samples: Any, _: str, run: int = 0, last: int = 0, seeds: int | None = None) -> Any:
+    """Returns the interquartile mean over seeds of a run, at its last points, and its interval."""
+    means = samples[run][:seeds, -last:].mean(1)
+    return bootstrap.iqm(means), bootstrap.interval(bootstrap.iqm, means)
+
+
+def gain(samples: Any, _: str) -> Any:
+    """Returns by how much trainings exceed others, with an interval over seeds and fires."""
+    value = bootstrap.iqm_difference(*(sample.mean(1) for sample in samples[:2]))
+    return value, bootstrap.crossed_interval(bootstrap.iqm_difference, *samples[:2])
+
+
+def same(samples: Any, _: str) -> Any:
+    """Returns by how much networks exceed themselves otherwise, with an interval over fires."""
+    fires = samples[0].shape[1]
+    generator = np.random.default_rng(bootstrap.BOOTSTRAP_SEED)
+    drawn = generator.multinomial(fires, [1 / fires] * fires, bootstrap.RESAMPLES)
+    share = np.vstack([np.ones(fires), drawn]).T / fires
+    value, *resampled = bootstrap.iqm_difference(*(x @ share for x in samples[:2]), axis=0)
+    return value, [*np.quantile(resampled, [0.025, 0.975])]
+
+
+def ratio(samples: Any, measure: str) -> Any:
+    """Returns how many times better a method is than the best other one, with its interval."""
+    share = partial(bootstrap.iqm_ratio_share, higher=measure in metrics.HIGHER_IS_BETTER)
+    means = [values.mean(1) for values in samples if len(values)]
+    ends = bootstrap.interval(share, *means)
+    return bootstrap.as_ratio(float(share(*means))), ends and [*map(bootstrap.as_ratio, ends)]
+
+
+FUNCTIONS: dict[str, Any] = {
+    **{"iqm": iqm, "gain": gain, "same": same, "ratio": ratio, "last10": partial(iqm, last=2)},
+    **{f"run{i}": lambda samples, _, i=i: (iqm(samples, _, i)[0], None) for i in range(3)},
+    "seed0": partial(iqm, seeds=1),
+    "seeds": lambda samples, _: (len(samples[0]), None),
+}
+
+
+def pack(name: str, *folders: str) -> None:
+    """Writes evaluations, learning curves and configurations of runs to docs/data."""
+    rows: dict[Any, Any] = {}
+    curves, configs = [], {}
+    for label, folder in (text.split("=", 1) for text in folders):
+        for file in sorted(Path(folder).rglob("eval*.json")):
+            found = json.loads(file.read_text())
+            changed = file.stem.removeprefix("eval").replace("_", "@", 1)
+            for fires, policies in found["results"].items():
+                on = changed + (f":{fires}" if len(found["results"]) > 1 else "")
+                for policy, measured in policies.items():
+                    own = (label, found["seed"]) if policy == "learned" else (policy, None)
+                    for measure, values in measured.items():
+                        rows.setdefault((own[0] + on, own[1], measure), values)
+        for file in sorted(Path(folder).rglob("config.yaml")):
+            configs.setdefault(label, config := yaml.safe_load(file.read_text()))
+            lines = pd.read_json(file.with_name("metrics.jsonl"), lines=True).set_index("episode")
+            size = -(-len(lines) // POINTS)
+            means = lines.groupby((np.arange(len(lines)) // size + 1) * size).mean()
+            part = means.rename_axis("episode").melt(var_name="measure", ignore_index=False)
+            curves.append(part.dropna().reset_index().assign(run=label, seed=config["seed"]))
+    table = [(*key, fire, x) for key, values in rows.items() for fire, x in enumerate(values)]
+    data = pd.DataFrame(table, columns=["run", "seed", "measure", "fire", "value"])
+    save = partial(pd.DataFrame.to_csv, index=False, float_format="%.6g")
+    save(data.astype({"seed": "Int64"}), DATA / f"{name}.csv.xz")
+    if curves:
+        save(pd.concat(curves), DATA / f"{name}.curves.csv.xz")
+        (DATA / f"{name}.yaml").write_text(yaml.safe_dump(configs))
+
+
+def write() -> None:
+    """Writes the tables of all pages."""
+    for page in (ROOT / "README.md", *ROOT.glob("docs/**/*.md")):
+        page.write_text(written(page.read_text()))
+
+
+if __name__ == "__main__":
+    pack(*sys.argv[2:]) if sys.argv[1:] else write()
