@@ -6,22 +6,20 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from emberlink.envs.utils.atomic_io import user_path
-from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.comparison.comparison import Comparison, compare_runs
 from emberlink.trainers.comparison.report import free_folder, write_report
-from emberlink.trainers.config.basics import MAX_FIRES
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import GROUPS
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
 from emberlink.trainers.evaluation.evaluate_run import evaluate_run
-from emberlink.trainers.evaluation.foreign import FOREIGN, foreign_config, new_run, open_policy
-from emberlink.trainers.evaluation.policy import TrainedPolicy, foreign_actor, load_policy
+from emberlink.trainers.evaluation.foreign import foreign_config, new_run, open_policy
+from emberlink.trainers.evaluation.policy import TrainedPolicy, foreign_policy, load_policy
 from emberlink.trainers.evaluation.scores import Results
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.terminal.signals import Interruption
@@ -146,28 +144,23 @@ def evaluate(
     Raises:
         UserError: see `load`.
     """
+    report = progress or (lambda *_: None)
+    settings |= {} if episodes is None else {"evaluation.episodes": episodes}
+    settings |= {} if scripted else {"evaluation.scripted": []}
     reference = ""
     if method is None:
-        loaded = load(policy, checkpoint=checkpoint, device=device, **settings)
-        config, actor = loaded.config, loaded.actor
+        played = load(policy, checkpoint=checkpoint, device=device, **settings)
     else:
         if isinstance(policy, (str, os.PathLike)):
             policy, reference = open_policy(os.fspath(policy))
         chosen = [f"{key}={settings.pop(key)}" for key in GROUPS if key in settings]
         settings |= {} if device is None else {"device": device}
         config = foreign_config(policy, method, chosen, **settings)
-        actor = foreign_actor(policy, name or "policy", config)
-    count = config.evaluation.episodes if episodes is None else episodes
-    if not 1 <= count <= MAX_FIRES:
-        raise UserError(f"episodes={count}: expected 1 to {MAX_FIRES}")
-    report = progress or (lambda *_: None)
-    if not scripted:
-        config = replace(config, evaluation=replace(config.evaluation, scripted=()))
-    if method is None or not name:
-        return evaluate_policy(config, actor, fires=count, report=report)
-    run = new_run(reference, name, config)
-    about: Any = {"checkpoint": run.path / FOREIGN, "about": [name]}
-    return evaluate_run(run, config, actor, fires=count, report=report, **about)
+        played = foreign_policy(policy, name, config)
+    if method is not None and name:
+        return evaluate_run(new_run(reference, name, played.config), played, report=report)
+    fires = played.config.evaluation.episodes
+    return evaluate_policy(played.config, played.actor, fires=fires, report=report)
 
 
 def load(

@@ -89,6 +89,12 @@ def build_env(
     return env
 
 
+def empty_env(config: RunConfig, num_envs: int = 1) -> TransformedEnv:
+    """Returns environments of a configuration without fire, for what a policy reads."""
+    fire = torch.full(config.env.grid, torch.inf)
+    return build_env(config, num_envs=num_envs, fire=fire, seed=0, device=config.device)
+
+
 def build_actor(
     config: RunConfig, env: TransformedEnv, generator: torch.Generator | None = None
 ) -> Any:

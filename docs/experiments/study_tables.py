@@ -45,27 +45,29 @@ def main(output: str) -> None:
         if folders:
             compared[world] = compare_runs(folders, [folder.name for folder in folders])
             print_arms(world, compared[world])
-    pairs = [(*planned, samples(compared.get(planned[0]), planned[1:])) for planned in PLANNED]
-    ps = [bootstrap.crossed_p(bootstrap.iqm_difference, *found) for *_, found in pairs if found]
+    pairs = {}
+    for world, one, other in PLANNED:
+        if world in compared and {one, other} <= set(compared[world].runs["label"]):
+            difference = compared[world].difference(one, other, headline(compared[world]))
+            pairs[world, f"{one} - {other}"] = difference
     # Comparisons whose runs are not there yet count, too.
-    ps += [None] * (len(PLANNED) - len(ps))
-    corrected = iter(bootstrap.holm([1.0 if p is None else p for p in ps]))
+    ps = [1.0 if found.p is None else found.p for found in pairs.values()]
+    corrected = bootstrap.holm(ps + [1.0] * (len(PLANNED) - len(ps)))
     _head("world", "comparison", "difference", "95 % interval", "p, Holm")
-    for world, one, other, found in pairs:
-        if found:
-            value = bootstrap.iqm_difference(*(sample.mean(1) for sample in found))
-            ends = bootstrap.crossed_interval(bootstrap.iqm_difference, *found)
-            _row(world, f"{one} - {other}", f"{value:.1f}", _ends(ends), f"{next(corrected):.4f}")
+    for (names, found), p in zip(pairs.items(), corrected, strict=False):
+        _row(*names, f"{found.value:.1f}", _ends(found.interval), f"{p:.4f}")
     _head("world", "arm", "value of communication")
     for world, runs in compared.items():
-        if found := samples(runs, UNLIMITED):
-            _row(world, UNLIMITED[1], value_of_communication(*found))
+        if set(UNLIMITED) <= set(runs.runs["label"]):
+            means = runs.means[runs.means["measure"] == headline(runs)]
+            found = [means[means["label"] == arm]["values"].tolist() for arm in UNLIMITED]
+            _row(world, UNLIMITED[1], value_of_communication(*map(np.array, found)))
 
 
 def print_arms(world: str, compared: Comparison) -> None:
     """Prints a row for each arm and each of its evaluations, best first."""
     runs, ranking = compared.runs, compared.ranking
-    measure = runs["object"].iloc[0].headline
+    measure = headline(compared)
     sent = ranking[ranking["measure"] == "bytes_per_step"].set_index("label")["iqm"]
     _head(f"{world}: {measure}", "seeds", "IQM", "95 % interval", "bytes", "rise")
     for row in ranking[ranking["measure"] == measure].to_dict("records"):
@@ -83,14 +85,9 @@ def rise_at_the_end(lines: Sequence[Any], measure: str) -> float:
     return float(np.mean(last[half:]) - np.mean(last[:half]))
 
 
-def samples(compared: Comparison | None, labels: Sequence[str]) -> list[Any]:
-    """Returns the headline of arms, [seeds, fires] each; nothing if one is missing."""
-    if compared is None:
-        return []
-    means = compared.means
-    means = means[means["measure"] == compared.runs["object"].iloc[0].headline]
-    found = [means[means["label"] == label]["values"].tolist() for label in labels]
-    return [np.array(values) for values in found] if all(found) else []
+def headline(compared: Comparison) -> str:
+    """Returns the headline measure of the compared runs."""
+    return compared.runs["object"].iloc[0].headline
 
 
 def value_of_communication(none: Any, arm: Any, full: Any) -> str:

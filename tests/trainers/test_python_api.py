@@ -54,7 +54,7 @@ def test_evaluate_is_the_evaluation_of_the_training(trained):
     alone = trainers.evaluate(str(trained.path), episodes=1, scripted=False, device="cpu")
     assert alone["huygens"].keys() == {"learned"}
     assert alone["huygens"]["learned"]["coverage"] == results["huygens"]["learned"]["coverage"][:1]
-    with pytest.raises(UserError, match="episodes=65537: expected 1 to 65536"):
+    with pytest.raises(UserError, match=r"evaluation\.episodes"):
         trainers.evaluate(trained.path, episodes=65_537)
     deaf = trainers.evaluate(trained.path, scripted=False, **{"env.radio.loss": 1.0})
     assert deaf.keys() == results.keys()

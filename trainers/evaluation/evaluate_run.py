@@ -3,7 +3,7 @@
 import argparse
 import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from emberlink.trainers.evaluation.foreign import (
     new_run,
     open_policy,
 )
-from emberlink.trainers.evaluation.policy import load_policy
+from emberlink.trainers.evaluation.policy import TrainedPolicy, load_policy
 from emberlink.trainers.evaluation.scores import LEARNED, Results, print_results, reporter
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.recording import Episode
@@ -48,16 +48,8 @@ def run_command(options: argparse.Namespace, console: Console) -> int:
     label = "".join(f"_{part}" for part in parts)
     if len(label) > _MAX_LABEL:
         label = f"{label[: _MAX_LABEL - 9]}_{hashlib.sha256(label.encode()).hexdigest()[:8]}"
-    results = evaluate_run(
-        run,
-        policy.config,
-        policy,
-        checkpoint=policy.checkpoint,
-        fires=options.fires or policy.config.evaluation.episodes,
-        report=reporter(console),
-        label=label,
-        about=[*changes, *about],
-    )
+    policy.changes += tuple(about)
+    results = evaluate_run(run, policy, options.fires, report=reporter(console), label=label)
     print_results(console, results, policy.config, foreign_name(run))
     console.print(str(run.path), soft_wrap=True)
     return 0
@@ -78,39 +70,28 @@ def _foreign_run(options: argparse.Namespace) -> Path:
 
 def evaluate_run(
     run: RunFolder,
-    config: RunConfig,
-    actor: evaluate.Policy,
+    policy: TrainedPolicy,
+    fires: int | None = None,
     *,
-    checkpoint: Path,
-    fires: int,
     report: Callable[[str, str], None] = lambda *_: None,
     label: str = "",
-    about: Sequence[str] = (),
 ) -> Results:
     """Evaluates a frozen policy and writes eval.json, the figures, a GIF and a replay page.
 
     Args:
-        checkpoint: file of the policy.
-        fires: number of test fires, one episode each.
+        fires: number of test fires, one episode each; `evaluation.episodes` if None.
         report: see `evaluate.evaluate`.
         label: suffix of the file names.
-        about: texts that the title of the replay names, such as changed settings.
     """
     with naming(run.path / "figures"):
         run.figures()  # an unusable folder is an error before the episodes, not after
-    recorder = recorder_of(config, actor)
-    results = evaluate.evaluate(
-        config,
-        actor,
-        fires=fires,
-        report=report,
-        watch=recorder.add,
-    )
-    shown = Episode(title=title_of(config, *about), recording=recorder.recording())
-    try:
-        _draw(run, config, results, shown, label)
-    except OSError as error:
-        raise UserError(f"{run.path / 'figures'}: {error.strerror or error}") from None
+    config, checkpoint = policy.config, policy.checkpoint
+    fires = fires or config.evaluation.episodes
+    recorder = recorder_of(config, policy)
+    watched = {"report": report, "watch": recorder.add}
+    results = evaluate.evaluate(config, policy.actor, fires=fires, **watched)
+    shown = Episode(title=title_of(config, *policy.changes), recording=recorder.recording())
+    _draw(run, config, results, shown, label)
     scenarios = evaluate.evaluation_scenarios(config)
     policies = next(iter(results.values()))
     content = {

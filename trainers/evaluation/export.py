@@ -74,7 +74,9 @@ def export(run: str | PathLike[str], file: str | Path) -> tuple[Path, Path]:
         raise UserError(f"export needs {error.name}: {needed}") from None
     policy = load_policy(read_run(fspath(run)), device="cpu")
     decision = Decision(policy)
-    example = observed(policy.config, decision, 3)
+    fire = torch.full(policy.config.env.grid, torch.inf)
+    start = make_env(policy.config, num_envs=3, fire=fire, seed=0).reset()
+    example = tuple(start.get(key) for key in decision.reads)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # of operators of packages not used
     with warnings.catch_warnings(action="ignore", category=FutureWarning):  # of torch's own code
         program: Any = torch.onnx.export(
@@ -93,13 +95,6 @@ def export(run: str | PathLike[str], file: str | Path) -> tuple[Path, Path]:
     with created(card_path) as partial:
         partial.write_text(json.dumps(card, indent=1) + "\n")
     return path, card_path
-
-
-def observed(config: RunConfig, decision: Decision, num_envs: int) -> tuple[Tensor, ...]:
-    """Returns what a policy reads at the first decision of an episode."""
-    env = make_env(config, num_envs=num_envs, fire=torch.full(config.env.grid, torch.inf), seed=0)
-    td = env.reset()
-    return tuple(td.get(key) for key in decision.reads)
 
 
 def _dynamic(config: RunConfig, tensor: Tensor) -> dict[int, Any]:

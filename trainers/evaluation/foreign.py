@@ -9,7 +9,6 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
-from datetime import datetime
 from pathlib import Path
 from typing import Any, cast
 
@@ -170,9 +169,7 @@ def new_run(reference: str, name: str, config: RunConfig) -> RunFolder:
         name: what comparisons call it.
         config: of its environment.
     """
-    stamp, plain = datetime.now().strftime("%Y-%m-%d_%H-%M-%S"), re.sub(r"[^\w.=+-]", "-", name)
-    label = f"{stamp}_{plain}_{config.setup}_{config.world}_s{config.seed}"
-    run = RunFolder.create(config, label)
+    run = RunFolder.create(config, label=re.sub(r"[^\w.=+-]", "-", name))
     run.write(FOREIGN, {"name": name, "policy": reference})
     return run
 

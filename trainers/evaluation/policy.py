@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import TensorDictPrimer
 
@@ -15,7 +14,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.policies.hold import held
 from emberlink.policies.state import primer_of
-from emberlink.trainers.build import build_actor, build_env
+from emberlink.trainers.build import build_actor, empty_env
 from emberlink.trainers.config.compose import differences, evaluated_with
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import parse
@@ -125,17 +124,18 @@ def load_policy(
         )
     changes = [*overrides, *(f"{key}={shown(value)}" for key, value in (settings or {}).items())]
     if file is None:
-        actor = foreign_actor(reopen(run), name, config)
-        return TrainedPolicy(actor, config, folder / FOREIGN, [name, *changes])
+        return foreign_policy(reopen(run), name, config, changes)
     return TrainedPolicy(load_actor(config, file), config, file, changes)
 
 
-def foreign_actor(policy: Any, name: str, config: RunConfig) -> Any:
+def foreign_policy(
+    policy: Any, name: str, config: RunConfig, changes: Sequence[str] = ()
+) -> TrainedPolicy:
     """Returns a policy that emberlink has not trained, deciding as often as `policy.hold` says."""
-    nowhere = torch.full(config.env.grid, torch.inf)
-    env = build_env(config, num_envs=1, fire=nowhere, seed=0, device=config.device)
-    actor = ForeignPolicy(policy, name, keys.observation_keys(env.observation_spec))
-    return held(actor, config.policy.hold, config.env.num_uavs)
+    observed = keys.observation_keys(empty_env(config).observation_spec)
+    actor: Any = ForeignPolicy(policy, name or "policy", observed)
+    actor = held(actor, config.policy.hold, config.env.num_uavs)
+    return TrainedPolicy(actor, config, Path(FOREIGN), [*filter(None, [name]), *changes])
 
 
 def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
@@ -144,9 +144,7 @@ def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
     It warns of settings that give observations or actions another meaning than in training (see
     `units`), and of a base that the networks never saw.
     """
-    nowhere = torch.full(config.env.grid, torch.inf)
-    env = build_env(config, num_envs=1, fire=nowhere, seed=0, device=config.device)
-    actor = build_actor(config, env)
+    actor = build_actor(config, empty_env(config))
     network: Any = actor.module
     expected = {ACTOR + name: value for name, value in network.state_dict().items()}
     weights = load_weights(checkpoint, expected, config)

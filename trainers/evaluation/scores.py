@@ -1,9 +1,10 @@
 """Defines the results of an evaluation, their means, and the table that is printed."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
 from emberlink.envs import metrics
@@ -68,17 +69,27 @@ def print_results(console: Console, results: Results, config: RunConfig, policy:
         others = [name for name in by_policy[LEARNED] if name not in metrics.NAMES]
         episodes = len(by_policy[LEARNED]["coverage"])
         settings = f"{episodes} episodes, mean; setup {config.setup}, world {config.world}"
+        rows = [(called if p == LEARNED else p, means(m)) for p, m in by_policy.items()]
         for measures in filter(None, (metrics.NAMES, others)):
-            table = plain_table(title=Text(f"test fires: {fire} ({settings})"))
-            table.add_column()
-            for name in measures:  # one word per line, so that the table fits 80 columns
-                table.add_column(name.replace("_", "\n"), justify="right")
-            for policy, measured in by_policy.items():
-                mean, learned = means(measured), policy == LEARNED
-                numbers = [_number(name, mean[name]) for name in measures]
-                name, style = (called, "bold") if learned else (policy, None)
-                table.add_row(name, *numbers, style=style)
-            console.print(table)
+            title = f"test fires: {fire} ({settings})"
+            console.print(means_table(title, rows, measures, bold=called))
+
+
+def means_table(
+    title: str,
+    rows: Iterable[tuple[str, Mapping[str, float]]],
+    measures: Sequence[str],
+    bold: str = "",
+) -> Table:
+    """Returns a table with a row per policy and its means, and a column per measure."""
+    table = plain_table(title=Text(title))
+    table.add_column()
+    for name in measures:  # one word per line, so that the table fits 80 columns
+        table.add_column(name.replace("_", "\n"), justify="right")
+    for policy, mean in rows:
+        numbers = [_number(name, mean[name]) for name in measures]
+        table.add_row(policy, *numbers, style="bold" if policy == bold else None)
+    return table
 
 
 def _number(measure: str, value: float) -> str:

@@ -57,10 +57,13 @@ class RunFolder:
                         )
 
     @classmethod
-    def create(cls, config: RunConfig, name: str = "") -> "RunFolder":
-        """Creates a new run folder in `config.output`, with config.yaml and the fires of files."""
-        stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-        name = name or f"{stamp}_{config.method}_{config.setup}_{config.world}_s{config.seed}"
+    def create(cls, config: RunConfig, name: str = "", *, label: str = "") -> "RunFolder":
+        """Creates a new run folder in `config.output`, with config.yaml and the fires of files.
+
+        It is called `name`, or after the time, the settings and `label` in place of the method.
+        """
+        about = f"{label or config.method}_{config.setup}_{config.world}_s{config.seed}"
+        name = name or f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{about}"
         with naming(f"output={config.output}"):
             path = _new_folder(atomic_io.user_path(config.output) / name)
         run = cls(path)

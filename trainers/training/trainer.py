@@ -12,6 +12,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.evaluation.evaluate_run import evaluate_run
+from emberlink.trainers.evaluation.policy import TrainedPolicy
 from emberlink.trainers.evaluation.scores import Results, learned_means, validated
 from emberlink.trainers.learners.base import Losses
 from emberlink.trainers.rollout.finite_actions import NonFiniteActionError
@@ -140,14 +141,8 @@ class Trainer:
             report: called with the names of the fire and the policy before each evaluation.
         """
         config, run = self.config, self.run
-        results = evaluate_run(
-            run,
-            config,
-            self.setup.actor,
-            checkpoint=run.checkpoint(),
-            fires=config.evaluation.episodes,
-            report=report,
-        )
+        policy = TrainedPolicy(self.setup.actor, config, run.checkpoint())
+        results = evaluate_run(run, policy, report=report)
         figures = sorted((run.path / "figures").glob("*.png"))
         self.tracker.log_evaluation(learned_means(results), figures)
         return results

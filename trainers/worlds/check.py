@@ -1,14 +1,11 @@
 """Runs `emberlink world check`: plays scripted policies and tests the conditions of a world."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from emberlink.envs import metrics
 from emberlink.envs.scenarios import fires_of
@@ -18,9 +15,8 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.evaluate import BLOCK, VALIDATION_START_SEED, play_scripted
-from emberlink.trainers.evaluation.scores import Measured, means
+from emberlink.trainers.evaluation.scores import Measured, means, means_table
 from emberlink.trainers.runs import compact_json
-from emberlink.trainers.terminal.console import plain_table
 
 Split = Literal["test", "validation"]
 Means = Mapping[str, Mapping[str, float]]
@@ -38,27 +34,23 @@ LEAST_AHEAD = 15.0
 _METHOD = "independent"  # any method; scripted policies do not depend on it
 
 
-@dataclass(frozen=True)
-class Condition:
+class Condition(NamedTuple):
     """A bound on the ratio of the headlines of two policies."""
 
-    name: str
-    """the two policies"""
+    policies: str
     ratio: float
     """headline of the first, in % of the second's"""
     bound: float
-    at_most: bool = False
-    """whether the bound is an upper one"""
+    kind: str = "at least"
 
     @property
     def passes(self) -> bool:
         """Whether the ratio keeps the bound."""
-        return self.ratio <= self.bound if self.at_most else self.ratio >= self.bound
+        return self.ratio <= self.bound if self.kind == "at most" else self.ratio >= self.bound
 
     def __str__(self) -> str:
-        kind = "at most" if self.at_most else "at least"
         verdict = "pass" if self.passes else "FAIL"
-        return f"{verdict}: {self.name}: {self.ratio:.1f} %; {kind} {self.bound:g}"
+        return f"{verdict}: {self.policies}: {self.ratio:.1f} %; {self.kind} {self.bound:g}"
 
 
 def conditions(means: Means, headline: str) -> list[Condition]:
@@ -84,7 +76,7 @@ def conditions(means: Means, headline: str) -> list[Condition]:
         best(lambda policy, end=end: policy.endswith(end)) for end in ("_all", "_alone")
     )
     return [
-        condition(RANDOM, oracle, MOST_AT_RANDOM, True),
+        condition(RANDOM, oracle, MOST_AT_RANDOM, "at most"),
         condition(merged, none, 100 + LEAST_GAIN),
         condition(oracle, best(lambda policy: not policy.startswith(ORACLE)), 100 + LEAST_AHEAD),
     ]
@@ -155,13 +147,20 @@ def check(
             policy: means(played(config, policy, fires=fires, split=split, report=say))
             for policy in config.evaluation.scripted
         }
-        found = conditions(measured, config.evaluation.headline)
-        console.print(_table(config, measured, f"{fires} {split} fires"))
+        headline = config.evaluation.headline
+        found = conditions(measured, headline)
+        title = f"world {config.world}: means of {fires} {split} fires"
+        order = sorted(metrics.names(config.env), key=lambda name: name != headline)
+        console.print(means_table(title, measured.items(), order))
         for condition in found:
             console.print(str(condition), style="" if condition.passes else "red", soft_wrap=True)
         console.print()
-        numbers = {"fires": fires, "split": split, "headline": config.evaluation.headline}
-        record[config.world] = numbers | _record(measured, found)
+        record[config.world] = {
+            **{"fires": fires, "split": split, "headline": headline},
+            "passes": all(condition.passes for condition in found),
+            "conditions": [{**one._asdict(), "passes": one.passes} for one in found],
+            "means": measured,
+        }
     if output is not None:
         with created(output) as file:
             file.write_text(compact_json.dumps(record) + "\n", encoding="utf-8")
@@ -180,36 +179,3 @@ def suite(console: Console) -> list[str]:
         except UserError as error:
             console.print(f"note: {name} is left out: {error}", soft_wrap=True)
     return names
-
-
-def _table(config: RunConfig, measured: Means, fires: str) -> Table:
-    """Returns a table with a row per policy and a column per measure, the headline first."""
-    table = plain_table(title=Text(f"world {config.world}: means of {fires}"))
-    table.add_column()
-    order = sorted(metrics.names(config.env), key=lambda name: name != config.evaluation.headline)
-    for name in order:
-        table.add_column(name.replace("_", "\n"), justify="right")
-    for policy, of_policy in measured.items():
-        table.add_row(policy, *(f"{of_policy[name]:.1f}" for name in order))
-    return table
-
-
-def _record(measured: Means, found: Sequence[Condition]) -> dict[str, Any]:
-    """Returns the conditions and means of a world for JSON."""
-    return {
-        "passes": all(condition.passes for condition in found),
-        "conditions": [
-            {
-                "policies": condition.name,
-                "ratio": round(condition.ratio, 3),
-                "at_most" if condition.at_most else "at_least": condition.bound,
-                "passes": condition.passes,
-            }
-            for condition in found
-        ],
-        "means": {policy: _rounded(of_policy) for policy, of_policy in measured.items()},
-    }
-
-
-def _rounded(figures: Mapping[str, float]) -> dict[str, float]:
-    return {name: round(number, 3) for name, number in figures.items()}

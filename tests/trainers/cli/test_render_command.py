@@ -12,7 +12,7 @@ from refusal import refused
 
 from emberlink.envs.utils.config_files import known
 from emberlink.policies.scripted.base import SCRIPTED
-from emberlink.trainers.build import build_actor, build_env
+from emberlink.trainers.build import build_actor, empty_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation import episodes, render
@@ -27,9 +27,7 @@ SHORT = ("setup=tuned", "learner.hidden=[8,8]", "env.horizon=12", "env.num_uavs=
 def make_run(folder, method="consensus", *overrides):
     """Writes a run folder with untrained networks."""
     config = resolve(method, [*SHORT, *overrides, f"output={folder}"])
-    nowhere = torch.full(config.env.grid, torch.inf)
-    env = build_env(config, num_envs=1, fire=nowhere, seed=0, device="cpu")
-    actor = build_actor(config, env, torch.Generator().manual_seed(config.seed))
+    actor = build_actor(config, empty_env(config), torch.Generator().manual_seed(config.seed))
     weights = {
         f"{checkpoint.WEIGHTS}{ACTOR}{name}": value
         for name, value in actor.module.state_dict().items()
