@@ -129,33 +129,28 @@ def _row(measure: str, samples: Sequence[Values], retrained: bool) -> dict[str, 
     """Returns the numbers of samples [seeds, fires]: radio off, the world's and maybe no limits."""
     means = [sample.mean(0) for sample in samples]
 
-    def ends(statistic: Callable[..., Any], count: int) -> tuple[Any, Any]:
+    def ends(statistic: Callable[..., Any], *places: int) -> tuple[Any, Any]:
         if retrained:
-            found = bootstrap.crossed_interval(statistic, *samples[:count])
+            found = bootstrap.crossed_interval(statistic, *(samples[i] for i in places))
         else:
-            found = bootstrap.interval(statistic, *means[:count], paired=True)
+            found = bootstrap.interval(statistic, *(means[i] for i in places), paired=True)
         return found or (None, None)
 
     none, with_radio, *rest = (float(mean.mean()) for mean in means)
     row: dict[str, Any] = {"none": none, "with_radio": with_radio, "gain": with_radio - none}
-    row["gain_low"], row["gain_high"] = ends(_gain, 2)
+    row["gain_low"], row["gain_high"] = ends(_gain, 0, 1)
     for full in rest:
         row["full"] = full
-        low, high = ends(_most, 3)
+        low, high = ends(_gain, 0, 2)
         if low is not None and (low > 0 if measure in metrics.HIGHER_IS_BETTER else high < 0):
             row["value"] = (with_radio - none) / (full - none)
-            row["value_low"], row["value_high"] = ends(_share, 3)
+            row["value_low"], row["value_high"] = ends(_share, 0, 1, 2)
     return row
 
 
 def _gain(none: Values, with_radio: Values, axis: int = -1) -> Any:
     """Returns with_radio - none of the means along an axis."""
     return with_radio.mean(axis) - none.mean(axis)
-
-
-def _most(none: Values, with_radio: Values, full: Values, axis: int = -1) -> Any:
-    """Returns full - none of the means along an axis, what a radio without limits gains."""
-    return _gain(none, full, axis)
 
 
 def _share(none: Values, with_radio: Values, full: Values, axis: int = -1) -> Any:

@@ -18,7 +18,6 @@ from emberlink.trainers.comparison.claims import verdicts
 from emberlink.trainers.comparison.communication import communication_values
 from emberlink.trainers.comparison.reading import LeftOut, read_all
 from emberlink.trainers.comparison.tables import Frame
-from emberlink.trainers.runs.compact_json import finite
 
 
 class Difference(NamedTuple):
@@ -122,14 +121,9 @@ class Comparison:
 
 
 def _records(table: Frame) -> list[dict[str, Any]]:
-    """Returns the rows of a table as plain values, with None for missing numbers."""
-    return [{k: _plain(v) for k, v in row.items()} for row in table.to_dict("records")]
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and np.isnan(value) else finite(value)
+    """Returns the rows of a table as plain values: None for missing, "inf" for infinite numbers."""
+    text = table.replace(np.inf, "inf").to_json(orient="records", double_precision=15)
+    return json.loads(text)
 
 
 def _one(what: str, name: str, known: Sequence[str]) -> str:

@@ -1,11 +1,11 @@
 """Draws the paper's figures 5 to 9 and the results of frozen policies."""
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from emberlink.envs import metrics
@@ -65,18 +65,18 @@ def training(
     panels = figure.subplots(1, len(measures), squeeze=False)[0]
     for axes, measure in zip(panels, measures, strict=True):
         for row in scripted[scripted["measure"] == measure].to_dict("records"):
-            axes.axhline(row["iqm"], color="0.3", ls=dashes[row["label"]], lw=1.3, zorder=1)
+            axes.axhline(row["iqm"], **dashes[row["label"]])
         for label, curve in curves[curves["measure"] == measure].groupby("label"):
             style = {"color": colours[label], "ls": ":" if measure == DOTTED else "-"}
-            marker = "o" if len(curve) == 1 else ""
-            axes.plot(curve["episode"], curve["iqm"], lw=2, marker=marker, **style)
+            style |= {"lw": 2, "marker": "o" if len(curve) == 1 else "", "label": _wrapped(label)}
+            axes.plot(curve["episode"], curve["iqm"], **style)
             if curve["low"].notna().all():
                 ends = curve["low"], curve["high"]
                 axes.fill_between(curve["episode"], *ends, color=colours[label], alpha=0.18, lw=0)
         axes.set(xlabel="episode of training", ylabel=CURVES[measure])
         axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
         axes.grid(alpha=0.3)
-    return _with_legend(figure, colours, dashes)
+    return _with_legend(figure, panels[0])
 
 
 def frozen(ranking: Frame, labels: Sequence[str]) -> Figure:
@@ -102,7 +102,7 @@ def frozen(ranking: Frame, labels: Sequence[str]) -> Figure:
             axes.plot([row["iqm"]], [y], "o", ms=6, **style)
             axes.plot([row["low"], row["high"]], [y, y], "|-", lw=2, ms=9, mew=1.5, **style)
         for row in scripted[scripted["measure"] == measure].to_dict("records"):
-            axes.axvline(row["iqm"], color="0.3", ls=dashes[row["label"]], lw=1.3, zorder=1)
+            axes.axvline(row["iqm"], **dashes[row["label"]])
         if measure in LOGARITHMIC:
             axes.set_xscale("symlog", linthresh=LOGARITHMIC[measure])
             axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
@@ -112,7 +112,7 @@ def frozen(ranking: Frame, labels: Sequence[str]) -> Figure:
         axes.set_ylim(-0.5, len(order) - 0.5)
         axes.grid(alpha=0.3, axis="x")
     panels[0].set_yticks(range(len(order)), names, parse_math=False)
-    return _with_legend(figure, {}, dashes)
+    return _with_legend(figure, panels[0])
 
 
 def _wrapped(label: str) -> str:
@@ -125,19 +125,18 @@ def _colours(labels: Sequence[str]) -> dict[str, str]:
 
 
 def _dashes(scripted: Frame) -> dict[str, Any]:
-    """Returns the line style of each scripted policy."""
-    names = sorted(scripted["label"].unique())
-    return {name: DASHES[i % len(DASHES)] for i, name in enumerate(names)}
-
-
-def _with_legend(figure: Figure, colours: Mapping[str, str], dashes: Mapping[str, Any]) -> Figure:
-    learned = {name: {"color": colour, "lw": 2} for name, colour in colours.items()}
-    lines = {
-        f"scripted: {name}": {"color": "0.3", "ls": d, "lw": 1.3} for name, d in dashes.items()
+    """Returns the line of each scripted policy."""
+    style = {"color": "0.3", "lw": 1.3, "zorder": 1}
+    return {
+        name: {**style, "ls": DASHES[i % len(DASHES)], "label": _wrapped(f"scripted: {name}")}
+        for i, name in enumerate(sorted(scripted["label"].unique()))
     }
-    handles = [Line2D([], [], label=_wrapped(n), **s) for n, s in (learned | lines).items()]
-    if handles:
+
+
+def _with_legend(figure: Figure, axes: Axes) -> Figure:
+    """Adds a legend of the lines of a panel that have labels."""
+    if (handles := axes.get_legend_handles_labels())[0]:
         place = {"loc": "outside right upper", "frameon": False, "handlelength": 3}
-        for text in figure.legend(handles=handles, **place).get_texts():
+        for text in figure.legend(*handles, **place).get_texts():
             text.set_parse_math(False)  # names are not formulas
     return figure

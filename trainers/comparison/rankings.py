@@ -1,6 +1,5 @@
 """Computes the rankings by measure, the results of scripted policies and the training curves."""
 
-from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from typing import Any
 
@@ -46,13 +45,13 @@ def rank(runs: Frame, means: Frame) -> Frame:
     rows: list[dict[str, Any]] = []
     for fires in sorted(means["fires"].unique(), key=lambda name: (name != first, name)):
         on_fires = means[means["fires"] == fires]
-        scripted = {name: _scripted(on_fires, name) for name in known}
         for measure in known:
             about = {"section": runs["section"].iloc[0], "fires": fires, "measure": measure}
-            why = different_rewards(runs, scripted) if measure == REWARD else ""
+            why = different_rewards(runs) if measure == REWARD else ""
             part = learned(on_fires[on_fires["measure"] == measure])
             ranked = _rows(part, measure in metrics.HIGHER_IS_BETTER, bool(why))
-            rows += [{**about, "not_ranked": why, **row} for row in [*ranked, *scripted[measure]]]
+            found = [*ranked, *_scripted(on_fires, measure)]
+            rows += [{**about, "not_ranked": why, **row} for row in found]
     return pd.DataFrame(rows, columns=list(RANKING))
 
 
@@ -96,18 +95,11 @@ def _scripted(means: Frame, measure: str) -> list[dict[str, Any]]:
     return rows
 
 
-def different_rewards(runs: Frame, scripted: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+def different_rewards(runs: Frame) -> str:
     """Returns why the rewards of a section cannot be compared; an empty text if they can."""
     settings = settings_table(runs["settings"]).filter(regex=r"^env\.reward\.")
-    for key in settings.columns[settings.nunique() > 1]:
-        return f"the methods' rewards differ in {key}"
-    for policy in dict.fromkeys(row["policy"] for row in scripted[REWARD]):
-        several = {
-            name: sum(row["policy"] == policy for row in rows) for name, rows in scripted.items()
-        }
-        if several.pop(REWARD) > 1 and set(several.values()) == {1}:
-            return f"the methods' rewards differ: {policy} acts alike and earns differently"
-    return ""
+    keys = settings.columns[settings.nunique() > 1]
+    return f"the methods' rewards differ in {', '.join(keys)}" if len(keys) else ""
 
 
 def differing(runs: Frame) -> Frame:
@@ -119,7 +111,8 @@ def differing(runs: Frame) -> Frame:
 
 def curves(runs: Frame) -> Frame:
     """Returns the interquartile mean over seeds, `iqm`, of each training episode of a section."""
-    parts: list[Frame] = []
+    columns = ["section", "label", "measure", "episode", "iqm", "low", "high"]
+    parts: list[Frame] = [pd.DataFrame(columns=columns)]
     trained = runs[runs["as_trained"] & runs["object"].map(lambda run: len(run.lines) > 0)]
     for label, group in trained.groupby("label"):
         for measure in CURVES:
@@ -130,8 +123,4 @@ def curves(runs: Frame) -> Frame:
             numbers = {"iqm": bootstrap.iqm(values, 0), "low": low, "high": high}
             episode = np.arange(1, values.shape[1] + 1)
             parts.append(pd.DataFrame({**about, "episode": episode, **numbers}))
-    if not parts:  # no policy of the section was trained here
-        return pd.DataFrame(
-            columns=["section", "label", "measure", "episode", "iqm", "low", "high"]
-        )
-    return pd.concat(parts, ignore_index=True)
+    return pd.concat(parts[1:] or parts, ignore_index=True)

@@ -126,8 +126,7 @@ def find(path: Path | str) -> list[Path]:
     if (folder / "config.yaml").is_file():
         return [folder]
     if not folder.is_dir():
-        hint = " (files such as compare.csv are written to --output FOLDER)" * bool(folder.suffix)
-        raise UserError(f"{folder}: there is no such run folder{hint}")
+        raise UserError(f"{folder}: there is no such run folder")
     if not (found := [file.parent for file in folder.glob("*/config.yaml")]):
         raise UserError(f"{folder}: neither a run folder nor a folder that holds runs")
     return found

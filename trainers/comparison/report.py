@@ -114,18 +114,15 @@ def _ranked(row: Mapping[str, Any]) -> dict[str, str]:
 
 def _gained(row: Mapping[str, Any]) -> dict[str, str]:
     digits = DIGITS.get(row["measure"], 1)
+    undetermined = "undetermined" if pd.notna(row["full"]) else NONE
     return {
         **{"fires": row["fires"], "policy": row["label"], "radios": row["radios"]},
         "radio off": _number(row["none"], digits),
         "with radio": _number(row["with_radio"], digits),
         "no limits": _number(row["full"], digits),
         "gain": _with_ends(row, "gain", digits + 1),
-        "value": _with_ends(row, "value", 2) if pd.notna(row["value"]) else _undetermined(row),
+        "value": undetermined if pd.isna(row["value"]) else _with_ends(row, "value", 2),
     }
-
-
-def _undetermined(row: Mapping[str, Any]) -> str:
-    return "undetermined" if pd.notna(row["full"]) else NONE
 
 
 def _claimed(row: Mapping[str, Any]) -> dict[str, str]:
@@ -254,7 +251,6 @@ def _chapter(
         "frozen": frozen,
         "tables": tables(comparison, section),
         "training": training,
-        "timelapses": _timelapses(trained),
         "details": _details(runs, folder),
     }
 
@@ -286,20 +282,6 @@ def _marl_eval(comparison: Comparison) -> str:
         runs = tasks.setdefault(str(row.section), {}).setdefault(str(row.label), {})
         runs[f"run_{row.seed}"] = steps
     return json.dumps({"emberlink": tasks}) + "\n"
-
-
-def _timelapses(trained: Frame) -> list[Picture]:
-    """Returns the timelapse that the evaluation of the first seed of each label has drawn."""
-    first = trained.drop_duplicates("label")
-    return [
-        _picture(
-            file.read_bytes(),
-            f"{label}, seed {seed}: the frozen policy on the first held-out fire of "
-            f"{file.stem.removeprefix('timelapse_')}. Fire white, field of view yellow, UAVs blue.",
-        )
-        for label, seed, run in zip(first["label"], first["seed"], first["object"], strict=True)
-        for file in sorted((run.path / "figures").glob("timelapse_*.png"))[:1]
-    ]
 
 
 def _details(runs: Frame, folder: Path) -> list[Table]:

@@ -38,7 +38,7 @@ def test_networks_evaluated_with_other_radios(tmp_path):
     assert row["value"] == pytest.approx(10 / 25)
     low, high = interval(row, "value")
     # each fire gains 10 of 20, 30, 30 or 20, so that all resamples are within 1/3 and 1/2
-    assert 1 / 3 <= low < 0.4 < high <= 0.5
+    assert 1 / 3 - 1e-9 <= low < 0.4 < high <= 0.5
 
 
 def test_networks_trained_with_other_radios(tmp_path):
@@ -69,7 +69,8 @@ def test_a_resample_without_anything_to_gain_leaves_no_interval(tmp_path):
     at_range(run, 0.0, learned=[50.0] * 4)
     at_range(run, float("inf"), learned=[50.0, 70.0, 70.0, 70.0])
     (row,) = values(tmp_path)
-    assert (row["value"], interval(row, "value")) == (35 / 60, (None, None))
+    assert row["value"] == pytest.approx(35 / 60)
+    assert interval(row, "value") == (None, None)
 
 
 def test_a_value_is_undetermined_where_no_limits_may_gain_nothing(tmp_path):
