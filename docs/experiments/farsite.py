@@ -1,25 +1,24 @@
 """Compares the level set with runs of FARSITE. Rates fitted on one run apply to all.
 
-    python docs/experiments/farsite.py FOLDER [--fit RUN] [--figure FILE.png]
+    python docs/experiments/farsite.py FOLDER [FIGURE.png]
 
-FOLDER holds `RUN_ArrivalTime.asc`: ESRI ASCII grids of elapsed minutes, north up. The wind is read
-from the whole name RUN: in `3mph120deg7hr` it blows from 120° (0 is north, clockwise); in
-`clockwise1hr` and `counterClockwise3hr` it starts from 180° and turns by 60° in that sense every
-hour or three hours.
-The fitted head rate and length-to-breadth ratio apply to one wind speed and one fuel.
-Prints a Markdown table. The initial fire is FARSITE's: the cells that burn at 0. Needs the extra
-`geo`.
+FOLDER holds `RUN_ArrivalTime.asc`, elapsed minutes. In a RUN called `3mph120deg7hr` the wind blows
+from 120° (0 is north, clockwise); in `clockwise1hr` and `counterClockwise3hr` from 180°, turning by
+60° in that sense every hour or three hours. The rates are fitted on the first run. Prints a table
+in Markdown. The initial fire is FARSITE's: the cells that burn at 0. Needs the extra `geo`.
 """
 
-import argparse
 import math
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import rasterio
 import torch
+from matplotlib.figure import Figure
 from scipy.optimize import minimize
 from torch import Tensor
 
@@ -29,11 +28,7 @@ from emberlink.envs.fire.level_set import (
     arrival_times,
     ellipse_rates,
 )
-from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.rasters import read_raster
-from emberlink.envs.fire_files.report import Report
 
-SUFFIX = "_ArrivalTime.asc"
 PARTS = (0.25, 0.5, 0.75, 1.0)
 """of a run's length: when the two are compared"""
 
@@ -57,8 +52,6 @@ def wind_of(name: str) -> Callable[[float], Tensor]:
     """Returns the azimuth of a run's wind as a function of the minutes."""
     steady = re.fullmatch(r"\d+mph(\d+)deg(\d+hr)?", name)
     turning = re.fullmatch(r"(c|counterC)lockwise(\d+)hr", name)
-    if not (steady or turning):
-        raise ValueError(f"{name}: no wind in this name; known: 3mph120deg…, clockwise1hr, …")
 
     def azimuth(minutes: float) -> Tensor:
         bearing = float(steady[1]) if steady else 180.0
@@ -70,23 +63,12 @@ def wind_of(name: str) -> Callable[[float], Tensor]:
     return azimuth
 
 
-def read_grid(path: Path) -> Tensor:
-    """Returns the arrival times of an ESRI ASCII grid, as in `Run`."""
-    try:
-        config = FileFireConfig(path=str(path), units="minutes", unburned="none")
-        times = read_raster(path, "asc", config, 0, Report())[0].times
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    return torch.from_numpy(times[::-1].T.copy()).float()
-
-
-def read_runs(folder: Path) -> dict[str, Run]:
-    """Returns the runs in a folder, in alphabetical order."""
-    files = sorted(folder.glob(f"*{SUFFIX}"))
-    if not files:
-        raise ValueError(f"{folder}: no *{SUFFIX} in it")
-    names = [file.name.removesuffix(SUFFIX) for file in files]
-    return {n: Run(n, read_grid(f), wind_of(n)) for n, f in zip(names, files, strict=True)}
+def read_run(path: Path) -> Run:
+    """Returns the run of an ESRI ASCII grid."""
+    with rasterio.open(path) as dataset:
+        times = dataset.read(1, masked=True).filled(np.inf)
+    name = path.name.removesuffix("_ArrivalTime.asc")
+    return Run(name, torch.from_numpy(times[::-1].T.copy()).float(), wind_of(name))
 
 
 def around(mask: Tensor) -> Distance:
@@ -136,73 +118,41 @@ def fit(run: Run) -> tuple[float, float]:
     return rates(minimize(cost, guess, method="Nelder-Mead", options=options).x)
 
 
-def overlap(got: Tensor, run: Run, minutes: float) -> float:
-    """Returns the intersection over union of the cells burnt by a time."""
-    ours, theirs = got <= minutes, run.arrival <= minutes
-    return float((ours & theirs).sum() / (ours | theirs).sum())
-
-
 def compare(run: Run, got: Tensor) -> tuple[list[float], float, float]:
     """Returns overlaps at `PARTS` of the run, final ratio of areas, mean error of arrival, minutes.
 
-    The error is taken over cells that burn in both, without the initial fire.
+    An overlap is the intersection over union of the burnt cells. The error is taken over cells that
+    burn in both, without the initial fire.
     """
-    overlaps = [overlap(got, run, part * run.end) for part in PARTS]
+    pairs = [(got <= part * run.end, run.arrival <= part * run.end) for part in PARTS]
+    overlaps = [float((ours & theirs).sum() / (ours | theirs).sum()) for ours, theirs in pairs]
     both = got.isfinite() & run.arrival.isfinite() & (run.arrival > 0)
     error = float((got - run.arrival)[both].abs().mean())
     return overlaps, float(got.isfinite().sum() / run.arrival.isfinite().sum()), error
 
 
-def draw(runs: list[tuple[Run, Tensor]], file: str) -> None:
-    """Draws both fronts of every run for each hour."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-    from matplotlib.lines import Line2D
-
-    size = (3.1 * len(runs), 3.9)
-    figure, panels = plt.subplots(1, len(runs), figsize=size, layout="constrained", squeeze=False)
-    for panel, (run, got) in zip(panels[0], runs, strict=True):
-        hours = np.arange(60, run.end + 1, 60)
+def main(folder: str, figure: str | None = None) -> None:
+    """Prints the table, and draws both fronts of every run for each hour."""
+    runs = [read_run(path) for path in sorted(Path(folder).glob("*_ArrivalTime.asc"))]
+    rates = fit(runs[0])
+    print(f"fitted on {runs[0].name}: {rates[0]:.4f} cells a minute, breadth {rates[1]:.3f}\n")
+    print(
+        "| run | IoU at 25, 50, 75, 100 % | area ratio | error of arrival, min |\n|---|---|---|---|"
+    )
+    picture = Figure((3.1 * len(runs), 3.9), layout="constrained")
+    for panel, run in zip(picture.subplots(1, len(runs), squeeze=False)[0], runs, strict=True):
+        overlaps, area, error = compare(run, got := simulate(run, *rates))
+        shares = ", ".join(f"{value:.3f}" for value in overlaps)
+        print(f"| `{run.name}` | {shares} | {area:.3f} | {error:.1f} |")
         for values, colour, style in ((run.arrival, "black", "-"), (got, "tab:red", "--")):
-            late = values.clamp_max(2 * run.end).T
+            late, hours = values.clamp_max(2 * run.end).T, np.arange(60, run.end + 1, 60)
             panel.contour(late, levels=hours, colors=colour, linestyles=style, linewidths=0.9)
         panel.contourf((run.arrival <= 0).T.float(), levels=[0.5, 1], colors="0.75")
         panel.set(title=run.name, aspect="equal", xticks=[], yticks=[])
-    handles = [Line2D([], [], color="black"), Line2D([], [], color="tab:red", linestyle="--")]
-    figure.legend(handles, ["FARSITE", "level set"], loc="outside lower center", ncols=2)
-    figure.savefig(file, dpi=110)
-
-
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--fit", help="the run to fit on, by default the first")
-    parser.add_argument("--figure", help="file to draw both fronts to")
-    given = parser.parse_args(arguments)
-    try:
-        runs = read_runs(given.folder)
-        name = given.fit or next(iter(runs))
-        if name not in runs:
-            raise ValueError(f"unknown run {name!r}; known: {', '.join(runs)}")
-    except (OSError, ValueError) as error:
-        parser.error(str(error))
-    head_rate, ratio = fit(runs[name])
-    print(f"fitted on {name}: {head_rate:.4f} cells a minute, length-to-breadth {ratio:.3f}\n")
-    done = [(run, simulate(run, head_rate, ratio)) for run in runs.values()]
-    times = " | ".join(f"IoU at {part:.0%}" for part in PARTS)
-    print(f"| run | {times} | area ratio | error of arrival, min |")
-    print("|---|" + "---|" * (len(PARTS) + 2))
-    for run, got in done:
-        overlaps, area, error = compare(run, got)
-        row = " | ".join(f"{value:.3f}" for value in overlaps)
-        print(f"| `{run.name}` | {row} | {area:.3f} | {error:.1f} |")
-    if given.figure:
-        draw(done, given.figure)
+    picture.suptitle("FARSITE (black) and the level set (red, dashed)")
+    if figure:
+        picture.savefig(figure, dpi=110)
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

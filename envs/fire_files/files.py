@@ -92,9 +92,8 @@ def find_format(path: Path) -> str:
             raise ask(f"{part.name}, beside it, is no TIFF", "one, or no such file")
         if size < (told := _declared(form or suffix, head.ljust(100, b"\0"))):
             raise ask(f"{part.name} is damaged", f"{told} bytes or more")
-    for suffix in (".shx", ".dbf") if kind == "shp" else ():
-        if suffix not in parts:
-            raise UserError(f"{path.with_suffix(suffix).name} is missing beside it")
+    if kind == "shp" and (missing := {".shx", ".dbf"} - {*parts}):
+        raise UserError(f"{path.stem}{min(missing)} is missing beside it")
     return kind
 
 
@@ -119,8 +118,7 @@ def members(folder: Path) -> list[Path]:
     paths = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES]
     paths = [path for path in paths if path.name.startswith(_GRID)] or paths
     if not 0 < len(paths) <= _MAX_FILES:
-        seen = f"a folder with {len(paths)} files of perimeters ({', '.join(_SUFFIXES)})"
-        raise ask(seen, f"a file, or a folder of up to {_MAX_FILES} of one fire")
+        raise ask(f"a folder with {len(paths)} files of perimeters", f"1 to {_MAX_FILES}")
     return sorted(paths, key=lambda path: (len(path.name), path.name))
 
 

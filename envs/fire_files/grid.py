@@ -1,6 +1,5 @@
 """Crops a fire to the cells of a grid, and stretches its times over an episode."""
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,7 +59,7 @@ class Window:
 
 
 @dataclass
-class Fire(ABC):
+class Fire:
     """A fire read from a file, on a plane."""
 
     clock: Clock
@@ -72,13 +71,13 @@ class Fire(ABC):
     whole: bool
     """True for a map of the whole grid, which is neither cropped nor burnt out"""
 
-    @abstractmethod
     def bounds(self, until: float | None) -> Bounds:
         """Returns the bounds of the area burnt by a time; None for those of the file."""
+        raise NotImplementedError
 
-    @abstractmethod
     def on(self, window: Window, until: float, report: Report) -> np.ndarray:
         """Returns the earliest arrival in each cell, float64 [X, Y]; all later ones may be inf."""
+        raise NotImplementedError
 
 
 def on_grid(
@@ -111,30 +110,29 @@ def on_grid(
 
 def _span(fire: Fire, config: FileFireConfig, horizon: int) -> tuple[float, float]:
     """Returns the times of the first and last step."""
-    start, end = (_time(key, fire, config) for key in ("start", "end"))
+    clock, steps = fire.clock, config.minutes_per_step
+    start, end = (_time(getattr(config, key), fire, config) for key in ("start", "end"))
     start, end = fire.began if start is None else start, fire.last if end is None else end
-    if config.minutes_per_step is not None:
-        if fire.clock.unit not in SECONDS:
-            raise ask(f"fire.minutes_per_step: times are in {fire.clock.unit}", "fire.units")
-        end = start + horizon * config.minutes_per_step * 60 / SECONDS[fire.clock.unit]
-    if end < fire.began or start >= fire.last or start >= end:
+    if steps is not None and clock.unit not in SECONDS:
+        raise ask(f"fire.minutes_per_step: times are in {clock.unit}", "fire.units")
+    if steps is not None:
+        end = start + horizon * steps * 60 / SECONDS[clock.unit]
+    if end < fire.began or start >= min(fire.last, end):
         raise _no_fire(fire, start, end)
     return start, end
 
 
-def _time(key: str, fire: Fire, config: FileFireConfig) -> float | None:
+def _time(value: float | str | None, fire: Fire, config: FileFireConfig) -> float | None:
     """Returns `fire.start` or `fire.end` in the clock's unit."""
-    value, clock = getattr(config, key), fire.clock
+    clock = fire.clock
     if value is None or (clock.origin is None and not isinstance(value, str)):
         return value
-    if clock.origin is None:
-        raise ask(f"fire.{key}={value}: the file's times are {clock.unit}", "a number of them")
-    if isinstance(value, str):
-        date = in_utc(parse_dates([value], config.time_format, f"fire.{key}")[0])
+    if isinstance(value, str) and clock.origin is not None:
+        date = in_utc(parse_dates([value], config.time_format, "fire.start or fire.end")[0])
         return (date - clock.origin).total_seconds() / SECONDS[clock.unit]
-    if config.units not in SECONDS:
-        seen = f"fire.{key}={value:g}: the file's times are dates"
-        raise ask(seen, f"such as {clock.format(fire.first)}", "fire.units for a number")
+    if isinstance(value, str) or config.units not in SECONDS:
+        seen = f"fire.start or fire.end={value}: times are such as {clock.format(fire.first)}"
+        raise ask(seen, "one of these, or a number with fire.units")
     return fire.first + value * SECONDS[config.units] / SECONDS[clock.unit]
 
 

@@ -41,7 +41,7 @@ class Perimeters(Fire):
         """Divides the time between two fronts by a sample's distances to both."""
         points, begun, idle = window.samples(), 0, 0
         burnt, times = np.zeros(points.grid, bool), np.full(points.grid, np.inf)
-        front: Any = KDTree(np.empty((0, 2)))
+        front = KDTree(np.empty((0, 2)))
         centres = np.stack(np.meshgrid(*points.axes(), indexing="ij"), -1)
         index = library("shapely").STRtree(library("shapely").points(centres.reshape(-1, 2)))
         for k, parts in enumerate(self.areas):
@@ -114,10 +114,10 @@ def read_perimeters(
     table: tuple[Any, list[str]], config: FileFireConfig, report: Report
 ) -> Perimeters:
     """Makes a fire of features, and of the columns whose values stand outside their attributes."""
-    (frame, outside), left_out = table, []
+    frame, outside = table
     points = frame.geom_type.isin(("Point", "MultiPoint"))
     if config.radius is None and points.all():
-        key = "fire.radius, metres of the circle around each, such as fire.radius=375 for VIIRS"
+        key = "fire.radius, metres around each, such as fire.radius=375 for VIIRS"
         raise ask(f"{len(frame)} points, as of satellite detections", key)
     kept = ~(frame.geometry.isna() | frame.geometry.is_empty | (points & (config.radius is None)))
     if not kept.any():
@@ -129,8 +129,7 @@ def read_perimeters(
     at, sizes = np.unique(values, return_counts=True)
     first, last = clock.format(at[0]), clock.format(at[-1])
     if not 2 <= len(at) <= _MAX_TIMES:
-        seen = f"{report.facts[0]}: {counted(len(at), 'time')}, from {first} to {last}"
-        raise ask(seen, f"2 to {_MAX_TIMES}")
+        raise ask(f"{report.facts[0]}: {counted(len(at), 'time')}", f"2 to {_MAX_TIMES}")
     why = "; ".join(left_out)
     report.facts = [
         f"perimeters of {len(at)} times, from {first} to {last}",
@@ -143,10 +142,8 @@ def read_perimeters(
     # A fire with elapsed times began at 0.
     if clock.origin is None and config.units != "day_of_year" and (config.start or 0) != at[0] > 0:
         if config.start is None and at[0] > at[-1] - at[0]:
-            seen = f"its times begin at {first} and end at {last}"
-            raise ask(
-                seen, "fire.start=0 if it began at 0", f"fire.start={at[0]:g} if it began then"
-            )
+            then = f"fire.start={at[0]:g} if it began then"
+            raise ask(f"times from {first} to {last}", "fire.start=0 if it began at 0", then)
         areas, at = [_at_zero(areas, at), *areas], np.concatenate([[0.0], at])
     return Perimeters(clock, *ends, float(at[0]), whole=False, areas=areas, at=at)
 

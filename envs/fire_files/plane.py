@@ -50,19 +50,14 @@ def choose_plane(crs: Any, wanted: str | None, bounds: Bounds) -> Plane:
     if source.is_geographic and not (in_degrees and size <= _MAX_DEGREES):
         seen = f"{where} are not the degrees of {source.name}, or too far apart for one UTM zone"
         raise ask(seen, "another fire.crs", "a file of the fire alone")
-    if not (source.is_projected or source.is_geographic):
-        return Plane(f"{source.name}, taken as a plane", source)
     shape, ratio = _shape(source, source, bounds)
-    if crs and wanted:
-        target = parse_crs(wanted)
-    elif ratio <= _BENT:
+    if not (crs and wanted) and ratio <= _BENT:
         return Plane(f"projection {source.name} ({shape})", source)
-    else:
-        box = library("geopandas").GeoSeries([library("shapely").box(*bounds)], crs=source)
-        try:
-            target = box.estimate_utm_crs()
-        except (RuntimeError, ValueError):
-            raise ask(f"{where}: no UTM zone is there", "fire.crs, in metres") from None
+    box = library("geopandas").GeoSeries([library("shapely").box(*bounds)], crs=source)
+    try:
+        target = parse_crs(wanted) if crs and wanted else box.estimate_utm_crs()
+    except RuntimeError:
+        raise ask(f"{where}: no UTM zone is there", "fire.crs, in metres") from None
     after, bent = _shape(target, source, bounds)
     if bent > _BENT:
         raise ask(f"fire.crs={wanted} has {after} here", "one as UTM is")
@@ -81,8 +76,8 @@ def parse_crs(value: Any) -> Any:
 
 def _shape(crs: Any, source: Any, bounds: Bounds) -> tuple[str, float]:
     """Returns how a projection bends a small circle at the fire, as text, and the ratio of axes."""
-    if crs.is_geographic:
-        return "degrees", math.inf
+    if not crs.is_projected:  # degrees, or a plane of its own
+        return ("degrees", math.inf) if crs.is_geographic else ("a plane", 1.0)
     pyproj = library("pyproj")
     at = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
     to_degrees = pyproj.Transformer.from_crs(source, source.geodetic_crs, always_xy=True)

@@ -266,10 +266,13 @@ def _bank(
 ) -> list[Raster]:
     """Returns fires in steps, [fires, X, Y], each a whole map."""
     count, columns, rows = fires.shape
-    states = np.unique(fires[:: max(1, count // 8)])
-    if len(states) <= 6 and np.isfinite(states).all() and (states % 1 == 0).all():
-        listed = ", ".join(f"{state:g} ({_share(fires, state)})" for state in states)
-        raise ask(f"{count} maps of the states {listed}", "arrival times", "fire.kind=masks")
+    if config.never is None and np.isfinite(fires[:: max(1, count // 8)]).all():
+        values, counts = np.unique(fires, return_counts=True)
+        most = np.argsort(-counts, kind="stable")[:6]
+        listed = ", ".join(f"{values[k]:g} ({counts[k] / fires.size:.0%})" for k in sorted(most))
+        keys = f"fire.unburned={values[most[0]]:g}", "fire.kind=masks", "fire.unburned=none"
+        states = slice(1, None) if len(values) <= 6 and (values % 1 == 0).all() else slice(None)
+        raise ask(f"{count} maps of the states {listed}, and no inf, never", *keys[states])
     if not SIDES[0] <= min(columns, rows) <= max(columns, rows) <= SIDES[1]:
         raise ask(f"fires of {columns} x {rows} cells", f"{SIDES[0]} to {SIDES[1]}")
     if config.units not in (None, "steps") and config.test is None:  # no other file has units
@@ -320,30 +323,26 @@ def _arrival(values: np.ndarray, nodata: np.ndarray | None, config: FileFireConf
 
     `nodata` is the file's mask; a bank has none: inf says there what never burns.
     """
-    times, in_bank = np.array(values, np.result_type(values, np.float32)), nodata is None
+    times = np.array(values, np.result_type(values, np.float32))
     void = ~(np.abs(times) <= _VOID) | np.isin(times, (*_NEVER, *(config.never or ())))
     times[void | (False if nodata is None else nodata)] = np.inf
-    told = times if in_bank else times[np.isfinite(times)]
+    told = times[np.isfinite(times)]
     wrong = (times < 0) | ((times > _MAX_TIME) & (times < np.inf))
     asked = np.unique(times[wrong])[:5].tolist()
-    if config.never is None:
-        asked += _plateaus(np.where(wrong, np.inf, times), in_bank=in_bank)
+    if config.never is None and nodata is not None:
+        asked += _plateaus(np.where(wrong, np.inf, times))
     if asked:
-        listed = " and ".join(f"{value:g} ({_share(told, value)} of the cells)" for value in asked)
+        shares = (f"{value:g} ({(told == value).mean():.0%} of the cells)" for value in asked)
         some = ",".join(f"{value:g}" for value in asked)
         key = f"'fire.unburned=[{some}]'" if len(asked) > 1 else f"fire.unburned={some}"
         others = times[np.isfinite(times) & ~np.isin(times, asked)]
         between = f"{others.min():g} to {others.max():g}" if len(others) else "none"
-        seen = f"{listed} may stand for cells that do not burn (others: {between})"
+        seen = f"{' and '.join(shares)} may stand for cells that do not burn (others: {between})"
         raise ask(seen, key, *([] if wrong.any() else ["fire.unburned=none if they burn then"]))
     return times
 
 
-def _share(values: np.ndarray, value: float) -> str:
-    return f"{100 * (values == value).mean():.0f} %"
-
-
-def _plateaus(times: np.ndarray, *, in_bank: bool) -> list[float]:
+def _plateaus(times: np.ndarray) -> list[float]:
     """Returns values that may stand for cells that do not burn.
 
     They hold more than half of the cells; or are the first or last value, and far from the rest or
@@ -351,12 +350,12 @@ def _plateaus(times: np.ndarray, *, in_bank: bool) -> list[float]:
     """
     finite = np.isfinite(times)
     values, counts = np.unique(times[finite], return_counts=True)
-    cells = times.size if in_bank else counts.sum()
+    cells = counts.sum()
     odd = {int(i) for i in np.flatnonzero(counts > 0.5 * cells)} if len(values) > 1 else set()
     edge = times[finite & ~binary_erosion(finite)]  # pyright: ignore
     for end, rest in ((0, slice(1, None)), (-1, slice(0, -1))):
         others = values[rest]
-        if len(others) > 2 and not in_bank:
+        if len(others) > 2:
             far = abs(values[end] - others[end]) > others[-1] - others[0]
             often = counts[end] > max(0.1 * cells, 3 * counts[rest].max())
             if far or (often and (edge == values[end]).mean() > 0.5):

@@ -9,10 +9,12 @@ import io
 import json
 import re
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
+
+import numpy as np
 
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.files import MAX_BYTES, find_format, first_line, library, members
@@ -64,7 +66,7 @@ def _of_file(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
         if kind == "json":
             frame, outside = _geojson(json.loads(path.read_bytes()))
         elif kind in ("kml", "kmz"):
-            frame, outside = _kml(_texts_of_kml(path, kind), layer), ["Name", "Folder"]
+            frame, outside = _kml(path, kind, layer), ["Name", "Folder"]
         elif kind == "csv":
             table = library("pandas").read_csv(path, dtype=str, skipinitialspace=True)
             at = {str(name).lower(): table[name] for name in table.columns}
@@ -91,7 +93,7 @@ def _by_gdal(path: Path, wanted: str | None) -> Any:
     pyogrio = library("pyogrio")
     names = [str(name) for name, kind in pyogrio.list_layers(path) if kind is not None]
     if wanted not in names and (wanted or len(names) != 1):
-        keys = [as_argument("fire.layer", name) for name in names[:30]] or ["one"]
+        keys = [as_argument("fire.layer", name) for name in names[:30]]
         raise ask(f"{len(names)} layers of perimeters", *keys)
     return pyogrio.read_dataframe(path, layer=wanted or names[0], datetime_as_string=True)
 
@@ -106,6 +108,9 @@ def _geojson(whole: Any) -> tuple[Any, list[str]]:
         if given.get("type") != "name":
             raise ask("its crs is a link, which is not followed", "a name, or none")
         crs = parse_crs(given["properties"]["name"])
+    for shape in (feature.get("geometry") or {} for feature in features):
+        if shape.get("type") == "Polygon":  # shapely reads arrays twice as fast
+            shape["coordinates"] = [np.array(ring) for ring in shape["coordinates"]]
     frame = library("geopandas").GeoDataFrame.from_features(features, crs=crs)
     if crs == _DEGREES and abs(frame.total_bounds).max() > 360:
         frame = frame.set_crs(None, allow_override=True)  # not as GeoJSON is defined
@@ -115,19 +120,17 @@ def _geojson(whole: Any) -> tuple[Any, list[str]]:
     return frame.assign(**about), list(about)
 
 
-def _texts_of_kml(path: Path, kind: str) -> list[bytes]:
-    if kind == "kml":
-        return [path.read_bytes()]
-    with zipfile.ZipFile(path) as archive:
-        parts = [part for part in archive.infolist() if part.filename.lower().endswith(".kml")]
-        if not parts or sum(part.file_size for part in parts) > MAX_BYTES:
-            raise ask(f"{len(parts)} .kml in it", f"one, of {MAX_BYTES} bytes at most")
-        return [archive.read(part) for part in parts]
-
-
-def _kml(contents: Sequence[bytes], layer: str | None) -> Any:
+def _kml(path: Path, kind: str, layer: str | None) -> Any:
     """Returns the placemarks of KML; GDAL gets their geometries alone."""
     rows, marks = [], ElementTree.Element("Document")
+    if kind == "kml":
+        contents = [path.read_bytes()]
+    else:
+        with zipfile.ZipFile(path) as archive:
+            parts = [part for part in archive.infolist() if part.filename.lower().endswith(".kml")]
+            if not parts or sum(part.file_size for part in parts) > MAX_BYTES:
+                raise ask(f"{len(parts)} .kml in it", f"one, of {MAX_BYTES} bytes at most")
+            contents = [archive.read(part) for part in parts]
     for content in contents:
         if b"\0" in content[:1000] or re.search(rb"<!(DOCTYPE|ENTITY)", content, re.IGNORECASE):
             raise ask("a document type declaration or UTF-16", "plain KML")
@@ -199,63 +202,58 @@ def column_named(name: str, frame: Any, key: str) -> Any:
 def choose_features(frame: Any, config: FileFireConfig, facts: list[str]) -> Any:
     """Returns the features of one fire; notes on the others are appended to `facts`."""
     for key, choose in (("where", _where), ("incident", _of_incident)):
-        kept = choose(frame, config, facts)
-        if len(kept) < len(frame):
-            left_out = len(frame) - len(kept)
+        kept = choose(frame, config)
+        if left_out := len(frame) - len(kept):
             facts.append(f"{left_out} left out by fire.{key}={getattr(config, key)}")
         frame = kept
     return frame
 
 
-def _where(frame: Any, config: FileFireConfig, _: list[str]) -> Any:
+def _where(frame: Any, config: FileFireConfig) -> Any:
     """Returns the features that `fire.where` keeps; asks if a category has several values."""
-    where = config.where
-    if where is not None and where != "*":
-        name, equals, pattern = where.partition("=")
-        values = frame[column := column_named(name, frame, "fire.where")]
-        escaped = re.escape(pattern.strip()).replace(r"\*", ".*").replace(r"\|", "|")
-        keeps = values.str.fullmatch(escaped, case=False) if equals else values != ""
-        if not keeps.any():
-            raise UserError(f"fire.where={where} keeps no feature; {_counts(frame, column)}")
-        return frame[keeps]
-    for column in attributes(frame) if where is None else ():
-        values, sure = frame[column], re.search("categ|featu", plain(column)) is not None
-        if _CATEGORY.fullmatch(plain(column)) and 1 < values.nunique() < len(frame) + sure:
-            choice = as_argument("fire.where", f"{column}={values.mode().iloc[0]}")
-            seen = f"features of several kinds: {_counts(frame, column)}"
-            raise ask(seen, choice, "fire.where=* for all of them")
-    return frame
+    if config.where is None:
+        for column in filter(lambda name: _CATEGORY.fullmatch(plain(name)), attributes(frame)):
+            sure = re.search("categ|featu", plain(column)) is not None
+            if 1 < frame[column].nunique() < len(frame) + sure:
+                choice = as_argument("fire.where", f"{column}={frame[column].mode().iloc[0]}")
+                seen = f"features of several kinds: {_counts(frame, column)}"
+                raise ask(seen, choice, "fire.where=* for all of them")
+    if config.where in (None, "*"):
+        return frame
+    name, equals, pattern = config.where.partition("=")
+    values = frame[column := column_named(name, frame, "fire.where")]
+    escaped = re.escape(pattern.strip()).replace(r"\*", ".*").replace(r"\|", "|")
+    keeps = values.str.fullmatch(escaped, case=False) if equals else values != ""
+    if not keeps.any():
+        raise ask(f"fire.where={config.where} keeps no feature", _counts(frame, column))
+    return frame[keeps]
 
 
-def _of_incident(frame: Any, config: FileFireConfig, facts: list[str]) -> Any:
+def _of_incident(frame: Any, config: FileFireConfig) -> Any:
     """Returns the features of `fire.incident`; asks if identifiers differ."""
     wanted, field, columns = config.incident, config.incident_field, attributes(frame)
-    if wanted == "*":
-        return frame
     sure = [name for name in columns if _IDENTIFIER.fullmatch(plain(name))]
     known = [*sure, *(name for name in columns if _MAYBE.fullmatch(plain(name)))]
     places = known if field is None else [column_named(field, frame, "fire.incident_field")]
     other = "fire.incident=* for all as one fire"
-    if wanted is None:
-        sure = sure if field is None else places
-    else:
+    if wanted not in (None, "*"):
         is_it = {at: frame[at].str.lower() == str(wanted).strip().lower() for at in places}
-        found = [at for at in places if is_it[at].any()]
-        if not found:
+        if not (found := [at for at in places if is_it[at].any()]):
             values = {text for at in places for text in frame[at] if text}
             raise UserError(f"fire.incident={unknown(str(wanted), sorted(values)[:30])}")
         frame, places = frame[is_it[found[0]]], known
         other = f"fire.incident_field={found[0]} beside fire.incident for all of these"
+    elif field is not None:
+        sure = places
+    if wanted == "*" or (wanted is not None and field is not None):
+        return frame
     counts = {name: frame[name].replace("", None).nunique() for name in places}
     several = [name for name, n in counts.items() if 1 < n < len(frame) + (name in sure)]
-    listed = "; ".join(_counts(frame, name) for name in several)
-    if several and wanted is not None and field is not None:
-        facts.append(f"which differ in {listed}")
-    elif several:
-        value = next(filter(None, frame[several[0]]))
+    if several:
+        answer = as_argument("fire.incident", next(filter(None, frame[several[0]])))
+        listed = "; ".join(_counts(frame, name) for name in several)
         seen = f"{len(frame)} features of several fires: {listed}"
-        answer = f"fire.incident_field={several[0]} {as_argument('fire.incident', value)}"
-        raise ask(seen, answer, other)
+        raise ask(seen, f"fire.incident_field={several[0]} {answer}", other)
     return frame
 
 

@@ -86,11 +86,11 @@ def read_times(
     if len(names) == 1 and config.time_format is None:
         numbers = library("pandas").to_numeric(written, errors="coerce")
         if numbers.notna().all() and not all(map(is_date, written.unique())):
-            if not numbers.between(0, 1e12).all():
-                raise ask(f"{names[0]} from {numbers.min():g} to {numbers.max():g}", "0 or more")
-            known = [u for u, form in _ELAPSED.items() if re.fullmatch(form, plain(names[0]))]
             about = f"{names[0]} ({numbers.min():g} to {numbers.max():g})"
-            unit = decided_unit(known[0] if known else None, config, about)
+            if not numbers.between(0, 1e12).all():
+                raise ask(about, "times of 0 or more")
+            known = (u for u, form in _ELAPSED.items() if re.fullmatch(form, plain(names[0])))
+            unit = decided_unit(next(known, None), config, about)
             report.facts.append(f"times from {names[0]}")
             return in_order(numbers.to_numpy(float), unit, config)
     if len(names) == 1 and not _has_clock(parse_dates([*written], config.time_format, names[0])):
@@ -135,15 +135,11 @@ def _columns(frame: Any, given: str | Sequence[str] | None, outside: Sequence[st
     elapsed = [n for n in elapsed if plain(n).startswith("elapsed") or not {*mapped} & {*dated}]
     beside = [name for name in outside if (frame[name] != "").all()]
     found = elapsed or timed or mapped or edited or beside
-    if not found:
-        columns = sorted(filled, key=lambda name: name not in dated)
-        seen = ", ".join(f"{name} ({frame[name].iloc[0][:30]})" for name in columns[:15])
-        key = as_argument("fire.time_field", str(columns[0])) if columns else "a column of times"
-        some = f"{key} or such, and fire.time_format if its form is unusual"
-        raise ask(f"no column of times is known, of {seen or 'none'}", some)
-    if (frame[found].nunique(axis=1) > 1).any():
-        seen = f"the columns {', '.join(map(str, found))} may hold the times"
-        raise ask(seen, f"fire.time_field={found[0]} or such")
+    maybe = found or sorted(filled, key=lambda name: name not in dated)[:15]
+    if not found or frame[found].ne(frame[found[0]], axis=0).any(axis=None):
+        seen = ", ".join(f"{name} ({frame[name].iloc[0][:30]})" for name in maybe)
+        key = as_argument("fire.time_field", maybe[0]) if maybe else "a column of times"
+        raise ask(f"which column holds the times: {seen or 'none'}?", f"{key} or such")
     return found[:1]
 
 
@@ -163,9 +159,12 @@ def _clocks_beside(frame: Any, date: Any, *, asked: bool) -> list[Any]:
     if len(paired) == 1:
         return [*paired, *(minutes if re.fullmatch(_HOUR, plain(paired[0])) else []), *halves]
     if (names := [*found, *halves]) and asked:
-        seen = f"{date} holds dates without a time of day, which {', '.join(map(str, names))}"
         join = f"'fire.time_field=[{date},{names[0]}]' to join them"
-        raise ask(f"{seen} may hold", join, f"fire.time_field={date}")
+        raise ask(
+            f"{date} has no times of day, maybe {', '.join(names)} has",
+            join,
+            f"fire.time_field={date}",
+        )
     return []
 
 
@@ -199,8 +198,8 @@ def decided_unit(known: str | None, config: FileFireConfig, what: str) -> str:
     """Returns the unit of the file or of the key; asks if there is none or they differ."""
     unit = config.units or known
     if unit is None:
-        some = "fire.units=minutes (FARSITE, FlamMap), seconds (ELMFIRE, WRF-SFIRE), hours, days"
-        raise ask(f"the unit of {what} is not known", f"{some}, day_of_year or steps")
+        some = "fire.units=minutes (FARSITE, FlamMap), seconds (ELMFIRE, WRF-SFIRE) or such"
+        raise ask(f"the unit of {what} is not known", some)
     if known not in (None, unit) and {known, unit} != {"days", "day_of_year"}:
         raise ask(f"{what} is in {known}", f"fire.units={known}, not {unit}")
     return unit
@@ -220,9 +219,8 @@ def in_order(
     if config.units == "day_of_year":
         values = np.where(values < first, values + gaps.sum(), values)
     elif config.start is None and cyclic and last < len(days) - 1 and gaps[last] > 183:
-        seen = f"days {days[0]:g} to {days[last]:g} and {first:g} to {days[-1]:g}, none between"
-        as_they_are = f"fire.start={days[0]:g} for days as they are"
-        raise ask(f"{seen}, as of a fire over New Year", "fire.units=day_of_year", as_they_are)
+        seen = f"days {days[0]:g} to {days[last]:g} and {first:g} to {days[-1]:g}, over New Year?"
+        raise ask(seen, "fire.units=day_of_year", f"fire.start={days[0]:g} for days as they are")
     return values, Clock("days", origin)
 
 
@@ -242,14 +240,13 @@ def parse_dates(texts: Sequence[str], form: str | None, key: str) -> list[dateti
         likely = {n for n, d in fits.items() if max(map(in_utc, d)) < now and d[0].year > 1980}
         fits = {name: fits[name] for name in fits if name in likely} or fits
     if not fits:
-        some = "fire.time_format, such as fire.time_format=%d.%m.%Y"
-        raise ask(f"{key}={text[:40]!r} is not a date", "such as 2020-08-19T13:00-07:00", some)
-    first, *others = fits.values()
-    if any([*map(in_utc, other)] != [*map(in_utc, first)] for other in others):
+        raise ask(f"{key}={text[:40]!r} is not a date", "such as fire.time_format=%d.%m.%Y")
+    if len({tuple(map(in_utc, dates)) for dates in fits.values()}) > 1:
         listed = " or ".join(f"{name} ({read[0]:%Y-%m-%d %H:%M})" for name, read in fits.items())
-        keys = [f"fire.time_format={name}" for name in fits]
-        raise ask(f"{key}={texts[0][:40]!r} fits {listed}", *keys)
-    return first
+        raise ask(
+            f"{key}={texts[0][:40]!r} fits {listed}", *map("fire.time_format={}".format, fits)
+        )
+    return next(iter(fits.values()))
 
 
 def is_date(text: str) -> bool:

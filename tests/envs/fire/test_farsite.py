@@ -38,6 +38,5 @@ def test_overlap_by_hand():
     run = farsite.Run("a", arrival, farsite.wind_of("3mph0deg"))
     got = torch.tensor([[0.0, 12.0], [math.inf, 18.0]])
     assert run.end == 20
-    assert farsite.overlap(got, run, 20) == 0.5
     assert farsite.compare(run, got) == ([1.0, 0.5, 1.0, 0.5], 1.0, 2.0)
     assert farsite.misfit(got, run) == (0 + 2 + 0 + 2) / 4

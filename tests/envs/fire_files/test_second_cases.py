@@ -68,9 +68,9 @@ CASES = {
     ),
     "5 end and five seconds": (
         raster(np.where(BURNS, TIMES, 305)[25:75, 25:75]),
-        ({"units": "seconds"}, r"305 \(75 % ", "seconds to 298.853"),
+        ({"units": "seconds"}, r"305 \(75 ?% ", "seconds to 298.853"),
     ),
-    "5 of a bank": (bank, ({}, r"9999 \(64 % ", "a bank of 2 fires .* 101 of 20 x 20")),
+    "5 of a bank": (bank, ({}, r"9999 \(64 ?%", "a bank of 2 fires .* 101 of 20 x 20")),
     "6 over New Year": (
         table("fire.gpkg", doy=[364, 365, 1]),
         ({"time_field": "doy", "units": "days"}, "units=day_of_year", "364 days to 366 days"),

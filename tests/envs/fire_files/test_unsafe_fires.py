@@ -153,7 +153,7 @@ def test_values_that_are_no_times(tmp_path):
         (np.full_like(times, np.nan), "0 cells burn"),
         (one, "1 cell burn"),
         (np.where(times >= 0, 3.0, times), "no fire spreads"),
-        (np.where(one == 5, -0.5, times), r"-0.5 \(1 % .*fire.unburned=-0.5"),
+        (np.where(one == 5, -0.5, times), r"-0.5 \(1 ?% .*fire.unburned=-0.5"),
         (np.where(times < 0, -32768.0, times), "fire.unburned=-32768"),
         (times.astype("complex64"), "real numbers"),
         (np.stack([times] * 3), "3 bands; expected one"),
