@@ -27,17 +27,13 @@ _REPEATABLE: dict[str, Any] = {"action": "append", "default": []}
 
 
 def add_train(commands: Any) -> None:
-    add = command(
-        commands,
-        "train",
-        _checked("training.command:train"),
-        "train one of the methods and evaluate it",
-        "Trains a method, evaluates the frozen policies on test fires, and writes a run folder "
-        "with config.yaml, metrics.jsonl, checkpoints, eval.json, figures, GIF and replay page.",
-        "emberlink train consensus setup=tuned episodes=20 seed=1",
-        usage="emberlink train METHOD [key=value ...]\n"
-        "       emberlink train resume=RUN [key=value ...]",
-    )
+    text = """train one of the methods and evaluate it
+    Trains a method, evaluates the frozen policies on test fires, and writes a run folder with
+    config.yaml, metrics.jsonl, checkpoints, eval.json, figures, GIF and replay page.
+    emberlink train consensus setup=tuned episodes=20 seed=1
+    """
+    usage = "emberlink train METHOD | resume=RUN [key=value ...]"
+    add = command(commands, "train", _checked("training.command:train"), text, usage=usage)
     method = "a method of emberlink list methods; or resume=RUN, to resume the training of a run"
     add("method", metavar="METHOD", help=method)
     keys = "any key of configs/base.yaml, such as setup=tuned, fire=huygens, seed=1, env.num_uavs=3"
@@ -74,18 +70,14 @@ def _check_names(method: str, overrides: list[str]) -> None:
 
 
 def add_eval(commands: Any) -> None:
-    add = command(
-        commands,
-        "eval",
-        "evaluation.evaluate_run:run_command",
-        "evaluate the frozen policies of a run, or a policy of your own",
-        "Plays the policies of a run's newest checkpoint and the scripted ones on the same test "
-        "fires, prints a table, and writes eval.json, figures, GIF and replay page to the run. A "
-        "policy of your own gets a run folder, which compare and render read.",
-        "emberlink eval mine.py:act independent setup=tuned --name mine",
-        usage="emberlink eval RUN [key=value ...]\n"
-        "       emberlink eval POLICY METHOD [key=value ...] --name NAME",
-    )
+    text = """evaluate the frozen policies of a run, or a policy of your own
+    Plays the policies of a run's newest checkpoint and the scripted ones on the same test
+    fires, prints a table, and writes eval.json, figures, GIF and replay page to the run. A
+    policy of your own gets a run folder, which compare and render read.
+    emberlink eval mine.py:act independent setup=tuned --name mine
+    """
+    usage = "emberlink eval RUN | POLICY METHOD --name NAME [key=value ...]"
+    add = command(commands, "eval", "evaluation.evaluate_run:run_command", text, usage=usage)
     run = "a run folder or pretrained:METHOD; or a policy: file.py:NAME, module:NAME or file.onnx"
     add("folder", metavar="RUN | POLICY", help=run)
     add(
@@ -102,15 +94,12 @@ def add_eval(commands: Any) -> None:
 
 
 def add_export(commands: Any) -> None:
-    add = command(
-        commands,
-        "export",
-        _export,
-        "write the policy of a run as an ONNX file",
-        "Writes the networks of a run's newest checkpoint as FILE.onnx, and FILE.json, which says "
-        "what they read and write, in which units. No existing file is replaced.",
-        "emberlink export pretrained:consensus consensus.onnx",
-    )
+    text = """write the policy of a run as an ONNX file
+    Writes the networks of a run's newest checkpoint as FILE.onnx, and FILE.json, which says
+    what they read and write, in which units. No existing file is replaced.
+    emberlink export pretrained:consensus consensus.onnx
+    """
+    add = command(commands, "export", _export, text)
     add("folder", metavar="RUN", help="a run folder, or pretrained:METHOD")
     add("file", metavar="FILE.onnx", type=path, help="a new file")
 
@@ -124,16 +113,13 @@ def _export(options: argparse.Namespace, console: "Console") -> int:
 
 
 def add_compare(commands: Any) -> None:
-    add = command(
-        commands,
-        "compare",
-        _compare,
-        "compare runs: methods, setups, several seeds",
-        "Gathers finished runs by setup, world, training fire and method and prints interquartile "
-        "means with 95 % bootstrap intervals over seeds, the gain of messages, and the paper's "
-        "claims; writes compare.html, with all tables and figures, and compare.json to a folder.",
-        "emberlink compare runs/ --output comparison",
-    )
+    text = """compare runs: methods, setups, several seeds
+    Gathers finished runs by setup, world, training fire and method and prints interquartile
+    means with 95 % bootstrap intervals over seeds, the gain of messages, and the paper's
+    claims; writes compare.html, with all tables and figures, and compare.json to a folder.
+    emberlink compare runs/ --output comparison
+    """
+    add = command(commands, "compare", _compare, text)
     folders = "run folders, folders of run folders, or names such as pretrained:tuned"
     add("folders", metavar="RUN", nargs="+", type=path, help=folders)
     add("--output", metavar="FOLDER", type=path, help="a new folder (default: compare)")
@@ -168,17 +154,13 @@ def _compare(options: argparse.Namespace, console: "Console") -> int:
 
 
 def add_render(commands: Any) -> None:
-    add = command(
-        commands,
-        "render",
-        "evaluation.render:render",
-        "an episode as GIF and MP4, or as a page to play; several runs side by side",
-        "Plays the frozen policies of runs on the same held-out fire from the same start "
-        "positions. Writes a GIF and an MP4 to the first run's figures, or with --output FILE.html "
-        "a page that plays the episodes in a browser. No existing file is replaced.",
-        "emberlink render pretrained:consensus pretrained:consensus env.radio.range=0 "
-        "--output replay.html",
-    )
+    text = """an episode as GIF and MP4, or as a page to play; several runs side by side
+    Plays the frozen policies of runs on the same held-out fire from the same start positions.
+    Writes a GIF and an MP4 to the first run's figures, or with --output FILE.html a page that
+    plays the episodes in a browser. No existing file is replaced.
+    emberlink render pretrained:maps pretrained:maps env.radio.range=0 --output replay.html
+    """
+    add = command(commands, "render", "evaluation.render:render", text)
     add(
         "runs",
         metavar="RUN",
@@ -204,14 +186,16 @@ def add_render(commands: Any) -> None:
 
 
 def add_sweep(commands: Any) -> None:
+    text = """train methods x seeds x setups
+    Trains and evaluates every combination, several runs at a time. Finished runs in the output
+    folder are skipped, and stopped ones are resumed by the same command.
+    emberlink sweep consensus positional setup=paper,tuned seed=0,1,2 output=runs
+    """
     add = command(
         commands,
         "sweep",
         "sweep.command:sweep",
-        "train methods x seeds x setups",
-        "Trains and evaluates every combination, several runs at a time. Finished runs in the "
-        "output folder are skipped, and stopped ones are resumed by the same command.",
-        "emberlink sweep consensus positional setup=paper,tuned seed=0,1,2 output=runs",
+        text,
         usage="emberlink sweep [--jobs N] [--dry-run] [METHOD ...] [key=value,value ...]",
     )
     add(
@@ -226,16 +210,13 @@ def add_sweep(commands: Any) -> None:
 
 
 def add_tune(commands: Any) -> None:
-    add = command(
-        commands,
-        "tune",
-        _checked("sweep.tune:tune"),
-        "choose a method's settings by validation fires",
-        "Trains a method again and again with settings that Optuna chooses, stops trainings that "
-        "are below the median, and prints the best settings. Trials are runs in "
-        "output/tune_METHOD_SETUP_WORLD; the same command continues.",
-        "emberlink tune consensus setup=strong world=front --trials 20",
-    )
+    text = """choose a method's settings by validation fires
+    Trains a method again and again with settings that Optuna chooses, stops trainings that are
+    below the median, and prints the best settings. Trials are runs in
+    output/tune_METHOD_SETUP_WORLD; the same command continues.
+    emberlink tune consensus setup=strong world=front --trials 20
+    """
+    add = command(commands, "tune", _checked("sweep.tune:tune"), text)
     add("method", metavar="METHOD", help="a method, as for train")
     add("overrides", help="keys as for train, which all trials have", **_OVERRIDES)
     add("--trials", metavar="N", type=positive, default=20, help="number of trials (default: 20)")
@@ -244,23 +225,18 @@ def add_tune(commands: Any) -> None:
 
 
 def add_world(commands: Any) -> None:
-    actions = command_group(
-        commands,
-        "world",
-        "test whether worlds are calibrated",
-        "Plays scripted policies to find out whether a world is hard enough and what messages "
-        "are worth in it.",
-        "emberlink world check front",
-    )
-    add = command(
-        actions,
-        "world check",
-        "worlds.check:check",
-        "test the conditions of the suite in worlds",
-        "Plays the scripted policies of worlds on test fires and prints their measures and the "
-        "conditions of the suite. The exit status is 1 if a world does not satisfy one.",
-        "emberlink world check front fire.burn_time=90 --validation --fires 32",
-    )
+    text = """test whether worlds are calibrated
+    Plays scripted policies to find out whether a world is hard enough and what messages are
+    worth in it.
+    emberlink world check front
+    """
+    actions = command_group(commands, "world", text)
+    text = """test the conditions of the suite in worlds
+    Plays the scripted policies of worlds on test fires and prints their measures and the
+    conditions of the suite. The exit status is 1 if a world does not satisfy one.
+    emberlink world check front fire.burn_time=90 --validation --fires 32
+    """
+    add = command(actions, "world check", "worlds.check:check", text)
     names = "worlds (default: those of the suite); keys to change, such as fire.burn_time=90"
     add("arguments", metavar="NAME | key=value", nargs="*", help=names)
     add("--fires", metavar="N", type=positive, default=100, help="number of fires (default: 100)")
@@ -271,12 +247,9 @@ def add_world(commands: Any) -> None:
 
 
 def add_doctor(commands: Any) -> None:
-    command(
-        commands,
-        "doctor",
-        "training.self_test:doctor",
-        "check the installation",
-        "Prints versions and devices and runs a self-test: a short fire, the environment of every "
-        "method, and updates of its networks. Prints how long the self-test took.",
-        "emberlink doctor",
-    )
+    text = """check the installation
+    Prints versions and devices and runs a self-test: a short fire, the environment of every
+    method, and updates of its networks. Prints how long the self-test took.
+    emberlink doctor
+    """
+    command(commands, "doctor", "training.self_test:doctor", text)

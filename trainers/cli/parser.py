@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
-from inspect import signature
+from inspect import cleandoc, signature
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -56,20 +56,19 @@ def command(
     commands: Any,
     name: str,
     run: Callable[..., int] | str,
-    summary: str,
-    description: str,
-    example: str,
+    *texts: str,
     usage: str | None = None,
 ) -> Callable[..., Any]:
     """Adds a command, such as "world check", and returns the function that adds its arguments.
 
     `run` is called with the options and a console, and returns the exit status; a text as for
-    `run_of`.
+    `run_of`. `texts` are the summary, the description and an example, or lines of all three.
     """
+    summary, *description, example = cleandoc("\n".join(texts)).splitlines()
     parser = commands.add_parser(
         name.split()[-1],
         help=summary,
-        description=description,
+        description=" ".join(description),
         epilog=f"example:\n  {example}",
         usage=usage,
         formatter_class=_Help,
@@ -96,9 +95,9 @@ def run_of(place: str) -> Callable[[argparse.Namespace, Any], int]:
     return run
 
 
-def command_group(commands: Any, name: str, summary: str, description: str, example: str) -> Any:
+def command_group(commands: Any, name: str, *texts: str) -> Any:
     """Adds a command with subcommands, which alone prints its help; returns their group."""
-    command(commands, name, lambda *_: group.print_help() or 0, summary, description, example)
+    command(commands, name, lambda *_: group.print_help() or 0, *texts)
     group = commands.choices[name]
     return group.add_subparsers(dest="action", metavar="ACTION")
 
