@@ -3,13 +3,7 @@
 import math
 from typing import Annotated, Literal
 
-from pydantic import (
-    Field,
-    Strict,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, Strict, ValidationInfo, field_validator, model_validator
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.errors import UserError
@@ -159,13 +153,3 @@ class WildfireConfig:
     def high(self) -> tuple[float, float, float]:
         """The box's corner with the largest coordinates, cells."""
         return self.grid[0] - 1.0, self.grid[1] - 1.0, self.altitude[1]
-
-
-def check_grid(grid: tuple[int, int]) -> None:
-    """Checks that each side of a grid has a supported number of cells, see `SIDES`.
-
-    Raises:
-        UserError: a side has fewer or more.
-    """
-    if not all(SIDES[0] <= side <= SIDES[1] for side in grid):
-        raise UserError(f"grid must have {SIDES[0]} to {SIDES[1]} cells a side, got {grid}")

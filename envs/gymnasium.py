@@ -43,12 +43,10 @@ class WildfireTeamEnv(gymnasium.Env[Any, NDArray[np.float32]]):
         self.observation_space: Space[Any] = self._team.state_space
         one: Any = self._team.observation_space("uav_0")
         if isinstance(one, Dict):
-            pictures = {k: box for k, box in one.items() if k != keys.OBSERVATION[1]}
-            spaces = {
-                k: Box(0, box.high.max(), (uavs, *box.shape), np.uint8)
-                for k, box in pictures.items()
-            }
-            self.observation_space = Dict({keys.OBSERVATION[1]: self._team.state_space, **spaces})
+            spaces: dict[str, Any] = {**one.spaces}
+            for name, box in spaces.items():
+                spaces[name] = Box(box.low.min(), box.high.max(), (uavs, *box.shape), box.dtype)
+            self.observation_space = Dict({**spaces, keys.OBSERVATION[1]: self._team.state_space})
         self.action_space = Box(-1.0, 1.0, (3 * uavs,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):

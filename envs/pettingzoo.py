@@ -100,9 +100,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         vector, space = observation_space(env, self._core.config)
         # One space object per agent, kept: PettingZoo seeds and compares them by identity.
         self.observation_spaces = {agent: deepcopy(space) for agent in self.possible_agents}
-        self.action_spaces: dict[str, Space] = {
-            agent: Box(-1.0, 1.0, (3,), np.float32) for agent in self.possible_agents
-        }
+        self.action_spaces = {a: Box(-1.0, 1.0, (3,), np.float32) for a in self.possible_agents}
         team = len(self.possible_agents)
         self.state_space = Box(np.tile(vector.low, team), np.tile(vector.high, team))
 
@@ -114,9 +112,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         """Returns the space of an agent's actions, the same object at each call."""
         return self.action_spaces[agent]
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None):
         """Starts an episode: the first of `seed` if it is given, else the next.
 
         The first episode of a seed is the next one until a step is made, since wrappers such as
@@ -140,15 +136,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         infos = self._of(self.agents, self._infos(self._now))
         return self._of(self.agents, self._observations()), infos
 
-    def step(
-        self, actions: dict[str, Array]
-    ) -> tuple[
-        dict[str, Observation],
-        dict[str, float],
-        dict[str, bool],
-        dict[str, bool],
-        dict[str, dict[str, Any]],
-    ]:
+    def step(self, actions: dict[str, Array]):
         """Moves all UAVs at once; after the end of an episode, returns empty dictionaries.
 
         Args:
@@ -294,23 +282,16 @@ def to_action(action: Any, size: int, agent: str = "the team") -> Array:
 
 def observation_space(env: EnvBase, config: WildfireConfig) -> tuple[Box, Space]:
     """Returns the space of an observation's vector, and of the whole observation."""
-    low, high = _bounds(config, env.observation_spec[keys.OBSERVATION].shape[-1])
-    vector = Box(low, high, dtype=np.float32)
+    features = env.observation_spec[keys.OBSERVATION].shape[-1]
+    low, high = [*config.low, 0, 0, 0], [*config.high, 1, 1, config.horizon]
+    if features != len(keys.FEATURES):  # communication has added numbers
+        low, high = [-np.inf] * features, [np.inf] * features
+    elif config.observation_scale == "box":
+        low, high = [-1, -1, -1, 0, 0, 0], [1, 1, 1, 1, 1, 1]
+    vector = Box(np.array(low, np.float32), np.array(high, np.float32))
     _, *others = keys.observation_keys(env.observation_spec)
     spaces: dict[str, Space] = {keys.OBSERVATION[1]: vector}
     for key in others:
         spec = env.observation_spec[key]
         spaces[key[1]] = Box(0, 1 if spec.dtype == torch.bool else 255, spec.shape[2:], np.uint8)
     return vector, Dict(spaces) if others else vector
-
-
-def _bounds(config: WildfireConfig, features: int) -> tuple[Array, Array]:
-    """Returns the smallest and largest vector; infinite where communication added numbers."""
-    if features != len(keys.FEATURES):
-        limit = np.full(features, np.inf, np.float32)
-        return -limit, limit
-    if config.observation_scale == "box":
-        low, high = [-1, -1, -1, 0, 0, 0], [1, 1, 1, 1, 1, 1]
-    else:
-        low, high = [*config.low, 0, 0, 0], [*config.high, 1, 1, config.horizon]
-    return np.array(low, np.float32), np.array(high, np.float32)

@@ -18,7 +18,7 @@ from pydantic import ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from emberlink.envs.config import BASE_SIDE, check_grid
+from emberlink.envs.config import BASE_SIDE
 from emberlink.envs.fire.level_set import MAX_LENGTH_TO_BREADTH, arrival_times, disc
 from emberlink.envs.fire.ranges import (
     TEST_FROM,
@@ -180,7 +180,6 @@ def make_fires(
         Arrival times in steps, float32 [fires, X, Y]: 0 burns from the start, inf never burns. Of a
         `ReactionConfig` arrival and burn-out times, float32 [fires, 2, X, Y].
     """
-    check_grid(grid)
     if isinstance(config, ReactionConfig):
         return reaction_fires(config, seeds, grid, horizon)
     refine = math.ceil(_MIN_NODES / min(grid))

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from emberlink.envs.fire_files.report import ask
-from emberlink.envs.utils.errors import UserError, how_to_install
+from emberlink.envs.utils.errors import UserError, missing
 
 MAX_BYTES = 150_000_000
 """Bytes of a text that is parsed whole."""
@@ -51,8 +51,7 @@ def library(name: str, what: str = "reading this file") -> Any:
     try:
         return importlib.import_module(name)
     except ImportError:
-        how = how_to_install("geo")
-        raise UserError(f"{what} needs the extra geo: {how} ({name} is missing)") from None
+        raise missing(name, "geo", what) from None
 
 
 @contextmanager

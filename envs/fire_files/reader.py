@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from emberlink.envs.config import check_grid
 from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
 from emberlink.envs.fire_files.files import TABLES, digest, find_format, quiet
 from emberlink.envs.fire_files.grid import Fire, on_grid
@@ -36,7 +35,6 @@ def read_with_summary(
     config: FileFireConfig, grid: tuple[int, int], horizon: int
 ) -> tuple[Tensor, str]:
     """Returns the fires of `read_fires` and the findings about the file; warns of a misreading."""
-    check_grid(grid)
     fires, report = [], Report()
     with _named(config.path, config.layer) as path, quiet():
         sources = _sources(path, config, horizon, report)

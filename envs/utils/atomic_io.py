@@ -11,9 +11,6 @@ from typing import BinaryIO
 
 from emberlink.envs.utils.errors import UserError, shown
 
-PART = ".part"
-"""suffix of incomplete files"""
-
 
 def user_path(path: os.PathLike[str] | str) -> Path:
     """Returns a path that the user gave, with the home folder for `~`."""
@@ -50,7 +47,7 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
 def replaced(path: Path) -> Iterator[Path]:
     """Yields a new empty file, which is renamed to `path` when the block ends without an error."""
     # The process number distinguishes processes that write to the same folder.
-    partial = path.with_name(f"{path.name}.{os.getpid()}{PART}")
+    partial = path.with_name(f"{path.name}.{os.getpid()}.part")
     partial.unlink(missing_ok=True)
     try:
         partial.touch(exist_ok=False)
@@ -72,12 +69,10 @@ def write_bytes(path: Path, content: bytes | memoryview) -> None:
 
 @contextmanager
 def created(path: Path) -> Iterator[Path]:
-    """Yields a new empty file, which is renamed to `path` at the end; nothing is overwritten."""
+    """Yields a new empty file, which is renamed to `path` of `new_file` or `free_name`."""
     try:
         with replaced(path) as partial:
             yield partial
-            if os.path.lexists(path):
-                raise UserError(f"{path} exists already; nothing is overwritten")
     except OSError as error:
         raise UserError(f"{shown(path)}: {error.strerror or error}") from None
 

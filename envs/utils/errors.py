@@ -1,7 +1,6 @@
 """Defines the error for mistakes of the user, and texts for its messages."""
 
 import difflib
-import re
 import reprlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -31,12 +30,13 @@ def naming(path: object, *more: type[Exception]) -> Iterator[None]:
 def require(package: str, extra: str, key: str) -> None:
     """Checks that a package of an extra, which the setting `key` needs, is installed."""
     if find_spec(package) is None:
-        raise UserError(f"{key}: {package} is not installed: {how_to_install(extra)}")
+        raise missing(package, extra, key)
 
 
-def how_to_install(extra: str) -> str:
-    """Returns the command that installs an extra of emberlink."""
-    return f"pip install '.[{extra}]' in the folder of emberlink"
+def missing(package: str, extra: str, what: str) -> UserError:
+    """Returns the error that a package of an extra, which `what` needs, is not installed."""
+    how = f"pip install '.[{extra}]' in the folder of emberlink"
+    return UserError(f"{what}: {package} is not installed: {how}")
 
 
 def shown(value: Any) -> str:
@@ -53,9 +53,8 @@ def printable(text: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Returns a message on one line, without control characters, with its longest words cut."""
-    line = printable(" ".join(text.split()))
-    return re.sub(r"\S{1000,}", lambda word: f"{word[0][:300]}...{word[0][-100:]}", line)
+    """Returns a message on one line, without control characters."""
+    return printable(" ".join(text.split()))
 
 
 def unknown(value: str, known: Iterable[str]) -> str:

@@ -51,8 +51,6 @@ def describe(error: ValidationError, prefix: str = "") -> str:
     first = (mistyped or errors)[0]
     parts = [str(part) for part in first["loc"] if not str(part).startswith(TAG)]
     key = ".".join([prefix, *parts] if prefix else parts)
-    if isinstance(cause := first.get("ctx", {}).get("error"), ValidationError):
-        return describe(cause, key)
     if first["type"] in ("missing", "unexpected_keyword_argument"):
         wrong = "missing" if first["type"] == "missing" else "not known"
         return f"key {shown(key)!r} is {wrong}"

@@ -53,12 +53,6 @@ def test_pettingzoo_rendering(monkeypatch):
     render_test(lambda **options: parallel_to_aec(small(**options)))
 
 
-@pytest.mark.parametrize("method", ["consensus", "maps"])
-def test_recipes_pass_the_api_test(method):
-    parallel_api_test(parallel_env(recipe(method)), num_cycles=35)
-    parallel_seed_test(lambda: parallel_env(recipe(method)), num_cycles=20)
-
-
 def compare(td: TensorDict, observations, infos, agents) -> None:
     for i, agent in enumerate(agents):
         given = observations[agent]

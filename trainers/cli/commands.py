@@ -191,21 +191,11 @@ def add_sweep(commands: Any) -> None:
     folder are skipped, and stopped ones are resumed by the same command.
     emberlink sweep consensus positional setup=paper,tuned seed=0,1,2 output=runs
     """
-    add = command(
-        commands,
-        "sweep",
-        "sweep.command:sweep",
-        text,
-        usage="emberlink sweep [--jobs N] [--dry-run] [METHOD ...] [key=value,value ...]",
-    )
-    add(
-        "arguments",
-        metavar="METHOD | key=value,value",
-        nargs="+",
-        help="methods (default: all); keys as for train, with one value or several; "
-        "executor=local, submitit (SLURM) or ray, and its keys executor.KEY=value",
-    )
-    add("--jobs", metavar="N", type=positive, help="the same as executor.workers=N")
+    usage = "emberlink sweep [--dry-run] [METHOD ...] [key=value,value ...]"
+    add = command(commands, "sweep", "sweep.command:sweep", text, usage=usage)
+    more = """methods (default: all); keys as for train, with one value or several;
+    executor=local, submitit (SLURM) or ray, and its keys executor.KEY=value"""
+    add("arguments", metavar="METHOD | key=value,value", nargs="+", help=more)
     add("--dry-run", action="store_true", help="only print the state of each run")
 
 
@@ -248,7 +238,7 @@ def add_world(commands: Any) -> None:
 
 def add_doctor(commands: Any) -> None:
     text = """check the installation
-    Prints versions and devices and runs a self-test: a short fire, the environment of every
+    Prints versions and devices and runs a self-test: the environment of every
     method, and updates of its networks. Prints how long the self-test took.
     emberlink doctor
     """

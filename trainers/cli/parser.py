@@ -1,24 +1,18 @@
 """Defines the parser of the command line, its one-line errors, and functions shared by commands."""
 
 import argparse
-import difflib
 import sys
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
 from inspect import cleandoc, signature
 from pathlib import Path
+from shutil import get_terminal_size
+from textwrap import fill
 from typing import Any, NoReturn
 
 from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.utils.errors import UserError, one_line
-
-
-class _Help(argparse.HelpFormatter):
-    """Wraps descriptions to the width of the terminal and leaves examples as they are."""
-
-    def _fill_text(self, text: str, width: int, indent: str) -> str:
-        return text if text.startswith("example:") else super()._fill_text(text, width, indent)
 
 
 class Parser(argparse.ArgumentParser):
@@ -39,10 +33,7 @@ class Parser(argparse.ArgumentParser):
         finally:
             self._is_intermixed = False
         if text := next((text for text in unknown if text.startswith("-")), ""):
-            options = [option for action in self._actions for option in action.option_strings]
-            near = difflib.get_close_matches(text.partition("=")[0], options, n=1)
-            hint = f"did you mean {near[0]}?" if near else "settings are given as key=value"
-            self.error(f"option {text} is not known; {hint}")
+            self.error(f"option {text} is not known; settings are given as key=value")
         return parsed, unknown
 
     def error(self, message: str) -> NoReturn:
@@ -53,11 +44,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def command(
-    commands: Any,
-    name: str,
-    run: Callable[..., int] | str,
-    *texts: str,
-    usage: str | None = None,
+    commands: Any, name: str, run: Callable[..., int] | str, *texts: str, usage: str | None = None
 ) -> Callable[..., Any]:
     """Adds a command, such as "world check", and returns the function that adds its arguments.
 
@@ -68,10 +55,10 @@ def command(
     parser = commands.add_parser(
         name.split()[-1],
         help=summary,
-        description=" ".join(description),
+        description=fill(" ".join(description), get_terminal_size().columns - 2),
         epilog=f"example:\n  {example}",
         usage=usage,
-        formatter_class=_Help,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
 
     parser.set_defaults(run=run_of(run) if isinstance(run, str) else run, command=name)

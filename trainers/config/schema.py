@@ -21,12 +21,7 @@ from emberlink.envs import metrics
 from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.plugins import Plugins
-from emberlink.envs.utils.validation import (
-    STRICT,
-    CountOrZero,
-    from_plain,
-    shown,
-)
+from emberlink.envs.utils.validation import STRICT, CountOrZero, from_plain, shown
 from emberlink.policies.networks.memory.base import MEMORIES
 from emberlink.policies.networks.messages import MESSAGES
 from emberlink.policies.scripted.base import SCRIPTED
@@ -101,10 +96,8 @@ class RunConfig(Basics):
     def _check_headline(self) -> "RunConfig":
         headline, known = self.evaluation.headline, metrics.names(self.env)
         if headline not in known:
-            raise UserError(
-                f"evaluation.headline={headline} is not measured in this world (env.measures, "
-                f"env.base); known: {', '.join(known)}"
-            )
+            where = "is not measured in this world (env.measures, env.base)"
+            raise UserError(f"evaluation.headline={headline} {where}; known: {', '.join(known)}")
         return self
 
     @field_validator("policy")
@@ -126,22 +119,18 @@ class RunConfig(Basics):
         """Checks that an episode consists of whole rollouts, as a training needs."""
         steps = decisions * self.policy.hold
         if self.env.horizon % steps:
-            raise UserError(
-                f"env.horizon={self.env.horizon}: must be a multiple of {steps}, the steps of "
-                f"{'a decision' if decisions == 1 else f'{decisions} decisions'} "
-                f"(policy.hold={self.policy.hold})"
-            )
+            of = f"{decisions} decisions (policy.hold={self.policy.hold})"
+            wrong = f"env.horizon={self.env.horizon}"
+            raise UserError(f"{wrong}: must be a multiple of {steps}, the steps of {of}")
 
 
 def build_comm(config: RunConfig, num_envs: int) -> CommModule:
     """Returns a new communication module; warns if it does not heed a limit of bytes."""
     kind, limit = MODULES.find(config.comm["name"]), config.env.radio.bandwidth
     if limit is not None and kind.hears and not kind.heeds_bandwidth:
-        warnings.warn(
-            f"env.radio.bandwidth={limit}: the messages of comm.name={config.comm['name']} are not "
-            "limited",
-            stacklevel=2,
-        )
+        name = config.comm["name"]
+        said = f"env.radio.bandwidth={limit}: the messages of comm.name={name} are not limited"
+        warnings.warn(said, stacklevel=2)
     module = kind(config.env, _settings("comm", config.comm, MODULES), num_envs)
     module.hold = config.policy.hold
     return module

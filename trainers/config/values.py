@@ -26,7 +26,7 @@ from yaml import YAMLError
 
 from emberlink.envs.utils import config_files
 from emberlink.envs.utils.config_files import find, read
-from emberlink.envs.utils.errors import UserError, shown, unknown
+from emberlink.envs.utils.errors import UserError, naming, shown, unknown
 from emberlink.envs.utils.validation import plain
 
 GROUPS = ("setup", "world", "fire", "learner")
@@ -188,8 +188,8 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Returns the values of nested mappings by dotted key."""
     result: dict[str, Any] = {}
     for key, value in values.items():
-        below = flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else None
-        result |= {f"{prefix}{key}": value} if below is None else below
+        nested = isinstance(value, Mapping)
+        result |= flat(value, f"{prefix}{key}.") if nested else {f"{prefix}{key}": value}
     return result
 
 
@@ -218,12 +218,12 @@ def _compose(
     # The last folder is emberlink's own, which Hydra searches anyway.
     paths = ["'file://" + str(folder).replace("'", "\\'") + "'" for folder in folders[:-1]]
     overrides = [f"{group}={name}" for group, name in names]
-    try:
-        with _own_hydra():
-            whole = compose("base", [*overrides, f"hydra.searchpath=[{','.join(paths)}]"])
-            values: Any = OmegaConf.to_container(whole)
-    except (HydraException, OmegaConfBaseException, YAMLError, UnicodeError) as error:
-        raise UserError(" ".join(str(error).split())[:300]) from None
+    with (
+        naming("the configuration", HydraException, OmegaConfBaseException, YAMLError),
+        _own_hydra(),
+    ):
+        whole = compose("base", [*overrides, f"hydra.searchpath=[{','.join(paths)}]"])
+        values: Any = OmegaConf.to_container(whole)
     return values
 
 
@@ -245,10 +245,7 @@ def _interpolated(values: dict[str, Any]) -> dict[str, Any]:
     """Returns the values with each `${key}` replaced by the value of the key."""
     if not any(mark in str(values) for mark in ("${", "???")):
         return values  # OmegaConf takes several milliseconds.
-    try:
-        whole: Any = OmegaConf.to_container(
-            OmegaConf.create(values), resolve=True, throw_on_missing=True
-        )
-    except OmegaConfBaseException as error:
-        raise UserError(" ".join(str(error).split())[:300]) from None
-    return whole
+    with naming("the configuration", OmegaConfBaseException):
+        whole = OmegaConf.create(values)
+        resolved: Any = OmegaConf.to_container(whole, resolve=True, throw_on_missing=True)
+    return resolved

@@ -18,7 +18,7 @@ from torch import Tensor
 from emberlink.envs.utils.atomic_io import open_regular, replaced
 from emberlink.envs.utils.errors import UserError, naming
 from emberlink.envs.utils.validation import STRICT, CountOrZero, from_plain, shown
-from emberlink.trainers.config.compose import differences, from_values, to_values
+from emberlink.trainers.config.compose import differences, to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.learners.tensors import check_like
@@ -94,12 +94,6 @@ def read_tensors(path: Path, prefix: str = "") -> dict[str, Tensor]:
     with naming(path, SafetensorError), safe_open(path, "pt") as file:
         chosen = [name for name in file.offset_keys() if name.startswith(prefix)]
         return {name.removeprefix(prefix): file.get_tensor(name) for name in chosen}
-
-
-def read_config(path: Path, **changes: Any) -> RunConfig:
-    """Returns the configuration that a checkpoint was trained with, with changed values."""
-    with naming(path):
-        return from_values({**read_header(path).config, "output": "runs", **changes})
 
 
 def load_weights(

@@ -4,6 +4,7 @@ import os
 import socket
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -24,9 +25,8 @@ class Lock:
     def __init__(self, folder: Path, patience: float = 0):
         self.path = folder / "lock"
         # No fallback to a lock without the operating system: its file would outlive the process.
-        self._lock = FileLock(
-            self.path, timeout=patience, thread_local=False, fallback_to_soft=False
-        )
+        how: Any = {"thread_local": False, "fallback_to_soft": False}
+        self._lock = FileLock(self.path, timeout=patience, **how)
         try:
             folder.stat()  # an error if it is missing: FileLock would create it
             self._lock.acquire()

@@ -1,6 +1,5 @@
 """Reads and writes run folders: configuration, metrics, checkpoints, evaluation, figures."""
 
-import itertools
 import json
 import os
 import re
@@ -79,10 +78,8 @@ class RunFolder:
     def values(self) -> dict[str, Any]:
         """Returns the configuration of config.yaml as plain values, without checking them."""
         file = self.path / "config.yaml"
-        if not self.path.is_dir():
-            raise UserError(f"{self.path}: there is no such run folder")
         if not file.exists():
-            raise UserError(f"{self.path}: not a run folder, config.yaml is missing")
+            raise UserError(f"{self.path}: no such run folder, config.yaml is missing")
         with naming(file, yaml.YAMLError):
             values = yaml.load(read_text(file, MAX_YAML), _WithoutAliases)
             if not isinstance(values, dict):
@@ -94,12 +91,11 @@ class RunFolder:
 
         Without `file` it is that of the newest or, before there is one, of config.yaml.
         """
-        values: dict[str, Any] = {"output": str(self.path.parent), **changes}
-        if file is None and not self.newest.exists():
-            given = self.values()
-            with naming(self.path / "config.yaml"):
-                return self.with_fires(from_values(given | values))
-        return self.with_fires(checkpoint.read_config(file or self.newest, **values))
+        file = self.newest if file is None and self.newest.exists() else file
+        given = checkpoint.read_header(file).config if file else self.values()
+        with naming(file or self.path / "config.yaml"):
+            values = {**given, "output": str(self.path.parent), **changes}
+            return self.with_fires(from_values(values))
 
     def with_fires(self, config: RunConfig) -> RunConfig:
         """Returns a configuration that reads the fires of files from the run's copy."""
@@ -122,9 +118,8 @@ class RunFolder:
         An incomplete last line, which a killed process left, is ignored.
         """
         path = self.path / METRICS
-        text = read_text(path, MAX_JSON) if path.exists() else ""
+        *lines, _ = read_text(path, MAX_JSON).split("\n") if path.exists() else [""]
         with naming(path):
-            lines = text[: text.rfind("\n") + 1].splitlines()
             return [_LINE.validate_json(line) for line in lines]
 
     def append(self, line: Mapping[str, Any]) -> None:
@@ -142,10 +137,8 @@ class RunFolder:
         """Removes the lines of later episodes and the incomplete files of a killed process."""
         lines = [line for line in self.metrics() if line.get("episode", 0) <= episode]
         if [line.get("episode") for line in lines] != list(range(1, episode + 1)):
-            raise UserError(
-                f"{self.path / METRICS}: does not hold a line for each of the {episode} episodes "
-                "of the checkpoint"
-            )
+            lacks = f"lacks some of the {episode} episodes of the checkpoint"
+            raise UserError(f"{self.path / METRICS}: {lacks}")
         self.write_text(METRICS, "".join(f"{json.dumps(line)}\n" for line in lines))
         # safetensors writes to .tmp*
         for pattern in ("*.[0-9]*.part", ".tmp*", "figures/*.[0-9]*.part"):
@@ -216,9 +209,8 @@ def _is_ordinary(path: Path) -> bool:
 def _new_folder(path: Path) -> Path:
     """Creates `path`, or `path_2` and so on if it exists, and returns the new folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    for attempt in itertools.count(1):
-        candidate = path if attempt == 1 else path.with_name(f"{path.name}_{attempt}")
-        with suppress(FileExistsError):
-            candidate.mkdir()
-            return candidate
-    raise AssertionError
+    while True:
+        free = atomic_io.free_name(path.parent, path.name, [""])
+        with suppress(FileExistsError):  # another process was faster
+            free.mkdir()
+            return free

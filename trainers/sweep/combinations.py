@@ -18,28 +18,19 @@ from emberlink.trainers.runs.lock import Lock, LockedError
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep.executors.base import Task
 
-_NAMED = ("setup", "world", "seed")
-"""keys whose values are in every name"""
-
 
 @dataclass(eq=False)
 class Combination:
     """A run of a sweep."""
 
     config: RunConfig
-    swept: Sequence[str] = ()
-    """`key=value` of keys with several values, for the name"""
+    name: str
+    """the method, and `key=value` of the keys with several values"""
     overrides: tuple[str, ...] = ()
     """given `key=value` of keys that do not affect learning, for a resumed run"""
     folder: RunFolder | None = None
     failed: str = ""
     """why the training has failed, else empty"""
-
-    @property
-    def name(self) -> str:
-        """The method, the setup, the world, the other keys with several values, the seed."""
-        c = self.config
-        return ", ".join([c.method, c.setup, c.world, *self.swept, f"seed {c.seed}"])
 
     @property
     def episodes(self) -> int:
@@ -90,13 +81,13 @@ def combinations(arguments: Sequence[str]) -> list[Combination]:
     """
     methods = [text for text in arguments if "=" not in text] or list(known("method"))
     choices = [_values(text) for text in arguments if "=" in text]
-    several = {_key(texts[0]) for texts in choices if len(texts) > 1} - {*_NAMED}
+    several = {_key(texts[0]) for texts in choices if len(texts) > 1}
     found: dict[str, Combination] = {}
     for method, overrides in product(methods, product(*choices)):
         config = resolve(method, overrides)
-        swept = [text for text in overrides if _key(text) in several]
+        name = ", ".join([method, *(text for text in overrides if _key(text) in several)])
         free = tuple(text for text in overrides if _key(text) in NOT_LEARNT_WITH)
-        found.setdefault(identity(config), Combination(config, swept, free))
+        found.setdefault(identity(config), Combination(config, name, free))
     if not found:
         raise UserError("no run: a key has no value, as in seed=range(3,3)")
     if "output" in several:

@@ -26,19 +26,17 @@ def sweep(
     arguments: Sequence[str],
     console: Console,
     *,
-    jobs: int | None = None,
     dry_run: bool = False,
     executor: Executor | None = None,
 ) -> int:
     """Trains and evaluates the runs that are not finished, or only prints their states.
 
     `arguments` as for `combinations`, and also `executor=NAME` and `executor.KEY=VALUE`, which
-    `executor` replaces; `jobs` is `executor.workers`. Returns 1 if a run failed, 128 and the number
-    of a signal after it, else 0.
+    `executor` replaces. Returns 1 if a run failed, 128 and the number of a signal after it, else 0.
     """
     chosen = [text for text in arguments if text.startswith(("executor=", "executor."))]
     runs = combinations([text for text in arguments if text not in chosen])
-    executor = executor or make([*chosen, *([f"executor.workers={jobs}"] if jobs else [])])
+    executor = executor or make(chosen)
     output = user_path(runs[0].config.output)
     find_folders(runs, output)
     _check([run for run in runs if run.folder is None])
@@ -52,11 +50,8 @@ def sweep(
     for run in runs:
         if run.failed:
             console.print(f"{run.name}: {run.failed} (log: {run.log})", soft_wrap=True)
-    if status == 0:
-        place = shlex.quote(str(output))
-        console.print(f"compare them with: emberlink compare {place}", soft_wrap=True)
-    else:
-        console.print("the same command trains what is left")
+    then = f"compare them with: emberlink compare {shlex.quote(str(output))}"
+    console.print("the same command trains what is left" if status else then, soft_wrap=True)
     return status
 
 

@@ -77,14 +77,11 @@ def _announce(trainer: Trainer, console: Console) -> None:
     if read := fires_of(config.fire).summary(config.env.grid, config.env.horizon):
         console.print(f"read: {read}", soft_wrap=True, highlight=False, markup=False)
     if setup.step == setup.total_steps and run.evaluated():
-        console.print(
-            f"{run.path} is finished, {config.episodes} episodes; nothing is left to do. "
-            f"More: {_resume_command(trainer)} episodes={2 * config.episodes}",
-            soft_wrap=True,
-        )
-    else:
-        for note in _notes(trainer):
-            console.print(f"note: {note}", style="yellow", soft_wrap=True)
+        more = f"{_resume_command(trainer)} episodes={2 * config.episodes}"
+        console.print(f"{run.path} is finished; more episodes: {more}", soft_wrap=True)
+        return
+    for note in _notes(trainer):
+        console.print(f"note: {note}", style="yellow", soft_wrap=True)
 
 
 def _notes(trainer: Trainer) -> Iterator[str]:

@@ -46,9 +46,7 @@ def _restored(trainer: Trainer, run: RunFolder, lock: Lock, before: RunConfig) -
         trainer.restore()
         trainer.changed_versions = _other_versions(checkpoint.read_header(run.newest).versions)
     elif len(run.metrics()) > before.checkpoint_interval:
-        raise UserError(
-            f"{run.path}: holds no {run.newest.name}, and more episodes than before one"
-        )
+        raise UserError(f"{run.path}: holds no {run.newest.name}, and too many episodes for none")
     else:
         warm_start.start(trainer.setup.learner, trainer.config)
     # All checks have passed; files are changed from here on.

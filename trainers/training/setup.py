@@ -25,10 +25,7 @@ class TrainingSetup:
 
     def __init__(self, config: RunConfig):
         if tuple(map(int, version("torchrl").split(".")[:2])) < (0, 14):
-            raise UserError(
-                f"a training needs torchrl 0.14; version {version('torchrl')} is installed, with "
-                "which environments and evaluations work"
-            )
+            raise UserError(f"a training needs torchrl 0.14; installed is {version('torchrl')}")
         self.config, self.horizon = config, config.env.horizon
         self.total_steps = config.episodes * self.horizon
         self.step = 0

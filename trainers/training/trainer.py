@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from emberlink.envs import metrics
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, naming
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.evaluation.evaluate_run import evaluate_run
@@ -169,15 +169,12 @@ class Trainer:
         path = self.run.newest
         header = checkpoint.read_header(path)
         if not header.resumable:
-            raise UserError(f"{path}: holds networks alone; nothing can be resumed from it")
+            raise UserError(f"{path}: holds networks alone, so it cannot be resumed")
         if header.step > self.setup.total_steps:
             done = header.step / self.config.env.horizon
             raise UserError(f"episodes={self.config.episodes}: the run has done {done:g}")
-        try:
+        with naming(path, KeyError, RuntimeError, TypeError, IndexError):
             self.setup.load_state_dict(checkpoint.read_tensors(path), header.step)
-        except (ValueError, KeyError, RuntimeError, TypeError, IndexError) as error:
-            reason = " ".join(str(error).split())[:200]
-            raise UserError(f"{path}: does not fit this training: {reason}") from None
         self.saved = header.step
         before, now = header.config["evaluation"], self.config.evaluation
         compared = ("headline", "huygens", "interval_episodes", "interval")
@@ -204,10 +201,9 @@ class Trainer:
         """Writes best.safetensors if the headline measure is the best so far."""
         headline = self.config.evaluation.headline
         measured = validated(line, headline)
-        if measured is None:
-            if self.config.evaluation.interval:
-                return
-            measured = line[headline]
+        if measured is None and self.config.evaluation.interval:
+            return
+        measured = line[headline] if measured is None else measured
         higher = headline in metrics.HIGHER_IS_BETTER
         if self.best is None or (measured > self.best if higher else measured < self.best):
             self.best = measured

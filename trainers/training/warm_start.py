@@ -37,11 +37,12 @@ def start(learner: Learner, config: RunConfig) -> None:
 
 def _warn_of_other_observations(name: str, theirs: RunConfig, mine: RunConfig) -> None:
     """Warns of settings that give the same observations another meaning."""
-    more = units(mine)
-    more += ("env.base",) if mine.env.observation == "map" else ()  # maps show the base
+    more = ("env.base",) if mine.env.observation == "map" else ()  # maps show the base
     more += ("env.radio.",) if MODULES.find(mine.comm["name"]).hears else ()
     for key, (before, now) in differences(theirs, mine).items():
-        if key.startswith(_OBSERVED + more) and not key.startswith("comm.heading."):  # rewards
+        if key.startswith((*_OBSERVED, *units(mine), *more)) and not key.startswith(
+            "comm.heading."
+        ):  # rewards
             warnings.warn(
                 f"learner.warm_start={name}: its actors were trained with {key}={shown(before)}, "
                 f"this run has {shown(now)}",

@@ -196,5 +196,5 @@ def test_the_checksum_contains_the_files_beside(wholes, ending):
 @pytest.mark.parametrize(("module", "suffix"), [("rasterio", ".tif"), ("geopandas", ".gpkg")])
 def test_without_the_extra_the_message_names_it(wholes, module, suffix, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
-    refused(wholes[suffix], r"needs the extra geo: pip install")
+    refused(wholes[suffix], r"is not installed: pip install '.\[geo\]'")
     assert read(wholes[".npy"]).isfinite().any()

@@ -145,7 +145,6 @@ def installed(tmp_path, monkeypatch):
 
 def test_policies_of_other_packages_are_known(installed):
     assert SCRIPTED.find("still").__name__ == "Stationary"
-    assert {"still", "oracle"} <= {*SCRIPTED.known()}
     assert {"visited_map", "broken", "consensus"} <= {*MODULES.known()}
 
 

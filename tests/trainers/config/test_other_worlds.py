@@ -119,7 +119,6 @@ def test_an_evaluation_in_another_world(run, capsys):
     ("setting", "said"),
     [
         ("world=moon", "known: blackout, file, front, paper, relay, swarm"),
-        ("world=file", "fire.path"),
         ("fire.burn_time=5", "needs world=NAME, too"),
         ("world=swarm", "uavs=24"),
     ],

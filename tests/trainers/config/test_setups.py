@@ -7,7 +7,6 @@ import pytest
 
 from emberlink.comm.consensus import ConsensusConfig
 from emberlink.envs.config import RewardConfig, WildfireConfig
-from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.validation import from_plain
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import build_comm
@@ -126,24 +125,3 @@ def test_defaults_in_code_equal_setup_paper():
     settings = {key: value for key, value in config.comm.items() if key != "name"}
     assert settings.keys() == {field.name for field in dataclasses.fields(ConsensusConfig)}
     assert ConsensusConfig() == from_plain(ConsensusConfig, settings)
-
-
-EVERY_CHOICE = [
-    *({"learner": name} for name in known("learner")),
-    *({"fire": name} for name in known("fire") if name != "file"),
-    *({"setup": name} for name in known("setup")),
-]
-
-
-@pytest.mark.parametrize("choice", EVERY_CHOICE, ids=str)
-def test_every_key_of_a_configuration_can_be_set(choice):
-    chosen = [f"{group}={name}" for group, name in choice.items()]
-    config = resolve("maps", chosen)
-    values = {
-        key: value
-        for key, value in flat(to_values(config)).items()
-        if key.partition(".")[0] not in ("method", "setup", "world")
-        and key not in ("learner.name", "comm.name", "fire.kind", "fire.name")
-    }
-    assert {"env.reward.base", "env.radio.range"} <= values.keys()
-    assert resolve("maps", chosen, **values) == config

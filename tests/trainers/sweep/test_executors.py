@@ -5,13 +5,9 @@ import subprocess
 from dataclasses import fields
 from types import SimpleNamespace
 
-import pytest
-
-from emberlink.envs.utils import errors
 from emberlink.envs.utils.config_files import known as known_files
 from emberlink.envs.utils.config_files import read
-from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.sweep.executors.base import EXECUTORS, Task, make
+from emberlink.trainers.sweep.executors.base import EXECUTORS, Task
 from emberlink.trainers.sweep.executors.local import LocalConfig, LocalExecutor
 
 
@@ -20,13 +16,6 @@ def test_every_executor_has_a_file_with_its_settings():
     for name in EXECUTORS.known():
         keys = {field.name for field in fields(EXECUTORS.find(name).config_type)}
         assert keys == {*read("executor", name)} - {"name"}
-
-
-@pytest.mark.parametrize(("name", "extra"), [("submitit", "slurm"), ("ray", "ray")])
-def test_a_missing_package_is_named_with_its_extra(name, extra, monkeypatch):
-    monkeypatch.setattr(errors, "find_spec", lambda _: None)
-    with pytest.raises(UserError, match=rf"{name} is not installed: pip install '\.\[{extra}\]'"):
-        make([f"executor={name}"])
 
 
 def test_a_task_sees_its_share_of_threads_and_gpus(tmp_path, monkeypatch):

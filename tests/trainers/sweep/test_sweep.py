@@ -40,7 +40,7 @@ def folders_in(output) -> list[RunFolder]:
 
 def test_every_combination_once():
     assert names(["consensus", "independent", "setup=paper,tuned", "seed=0,2,2"]) == [
-        f"{method}, {setup}, paper, seed {seed}"
+        f"{method}, setup={setup}, seed={seed}"
         for method in ("consensus", "independent")
         for setup in ("paper", "tuned")
         for seed in (0, 2)
@@ -135,7 +135,7 @@ def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys):
     assert sweep(arguments, Console(width=300), executor=Instant(fails=[0])) == 1
     assert [len(run.metrics()) for run in folders_in(tmp_path)] == [0, 15, 15]
     said = capsys.readouterr().out
-    assert "seed 0: emberlink train: no such thing (log: " in said
+    assert "seed=0: emberlink train: no such thing (log: " in said
     assert "compare them with" not in said
 
 
@@ -154,7 +154,7 @@ def test_ctrl_c_cancels_what_runs_and_starts_nothing_else(tmp_path):
 
 def states(capsys) -> list[tuple[str, str]]:
     """Returns the states and episodes of the table that was printed."""
-    return re.findall(r"seed \d+\W+(\w+)\W+(\d+/\d+)", capsys.readouterr().out)
+    return re.findall(r"seed=\d+\W+(\w+)\W+(\d+/\d+)", capsys.readouterr().out)
 
 
 def test_a_dry_run_prints_states(tmp_path, capsys, monkeypatch):
