@@ -53,8 +53,8 @@ def printable(text: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Returns a message on one line, without control characters."""
-    return printable(" ".join(text.split()))
+    """Returns a message on one line, without control characters, with long words cut."""
+    return printable(" ".join(word[:400] for word in text.split()))
 
 
 def unknown(value: str, known: Iterable[str]) -> str:
