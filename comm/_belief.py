@@ -26,26 +26,26 @@ class BeliefMaps(nn.Module):
     """
 
     known: Knowledge
-    """the last looks at cells; stored are 4 times the step plus the cell's state then"""
+    """the last looks at cells, and after them at the positions of UAVs; stored are 4 times the step
+    plus the cell's state then"""
     view: View
     """the cells that the UAVs see at this step"""
-    stamp: Tensor
-    """int64 [envs, n, n]: steps at which UAVs know positions of UAVs, -1 for never"""
     place: Tensor
-    """float32 [envs, n, n, 3]: these positions, cells"""
+    """float32 [envs, n, n, 3]: positions of UAVs as UAVs (row) know them, cells"""
     crops: Tensor
     """uint8 [envs, n, ...]: the pictures last drawn"""
     low: Tensor
     high: Tensor
     _start: Tensor
+    _own: Tensor
     _base: Tensor
 
     def __init__(self, world: WildfireConfig, envs: int):
         super().__init__()
         self.world, self.sensor = world, Sensor.of(world)
-        uavs, area, settings = world.num_uavs, self.sensor.area, world.map
-        last = 4 * world.horizon + 3
-        self.known = Knowledge(envs=envs, uavs=uavs, area=area, horizon=last, fires=True)
+        uavs, settings = world.num_uavs, world.map
+        entries, last = self.sensor.area + uavs, 4 * world.horizon + 3
+        self.known = Knowledge(envs=envs, uavs=uavs, area=entries, horizon=last, fires=True)
         self.pictures = Crops(
             world.grid,
             pixels=settings.pixels,
@@ -56,12 +56,13 @@ class BeliefMaps(nn.Module):
         low, high = motion.corners(world.low, world.high)
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("high", high, persistent=False)
-        self.register_buffer("stamp", torch.full((envs, uavs, uavs), -1))
         self.register_buffer("place", torch.zeros(envs, uavs, uavs, 3, dtype=torch.float32))
         drawn = torch.zeros(envs, uavs, *self.pictures.shape, dtype=torch.uint8)
         self.register_buffer("crops", drawn)
-        first = torch.arange(envs).unsqueeze(-1) * area
+        first = torch.arange(envs).unsqueeze(-1) * entries
         self.register_buffer("_start", first, persistent=False)
+        own = self.sensor.area + torch.arange(uavs).unsqueeze(-1)
+        self.register_buffer("_own", own, persistent=False)
         base = torch.tensor([] if world.base is None else [world.base]).view(-1, 2)
         self.register_buffer("_base", _nearest(base), persistent=False)
 
@@ -78,27 +79,50 @@ class BeliefMaps(nn.Module):
     def start_episodes(self, mask: Tensor) -> None:
         """Forgets everything in the environments of a mask, bool [envs]."""
         self.known.start_episodes(mask)
-        self.stamp.masked_fill_(mask[:, None, None], -1)
+
+    @property
+    def looks(self) -> Tensor:
+        """The entries of cells in `known`, integers [envs, n, area]."""
+        return self.known.last_seen[..., : self.sensor.area]
+
+    @property
+    def stamp(self) -> Tensor:
+        """The steps at which UAVs know positions of UAVs, -1 for never, int64 [envs, n, n]."""
+        return self._stamps().long() >> 2
+
+    def _stamps(self) -> Tensor:
+        return self.known.last_seen[..., self.sensor.area :]
 
     def look(self, tensordict: TensorDictBase) -> None:
         """Adds each UAV's view and position to its map, and writes the vector that it observes."""
         position, step = tensordict.get(keys.POSITION), tensordict.get(keys.STEP)
-        sight = tensordict.get(keys.SIGHT).flatten(-2)
+        # A UAV sees its own position, too: an entry behind the cells.
+        alive = tensordict.get(keys.ALIVE).unsqueeze(-1).byte()
+        sight = torch.cat((tensordict.get(keys.SIGHT).flatten(-2), alive), -1)
         cells = self.sensor.look(position.double(), self._start)[1]
+        cells = torch.cat((cells, self._own.expand(len(step), -1, -1) + self._start[..., None]), -1)
         self.view = View(cells, sight > 0, sight == 2)
-        # Beyond the horizon, a step that does not fit into the map counts as the last that does.
-        latest = torch.iinfo(self.known.last_seen.dtype).max >> 2
-        self.known.see(self.view, 4 * step.clamp(max=latest).view(-1, 1, 1) + sight - 1)
-        own = self.stamp.diagonal(dim1=1, dim2=2)
-        own.copy_(torch.where(tensordict.get(keys.ALIVE), step.unsqueeze(-1), own))
+        self.known.see(self.view, self._first_of(step) + sight - 1)
         self.place.diagonal(dim1=1, dim2=2).copy_(position.mT)
         tensordict.set(keys.OBSERVATION, self._vector(position, step))
 
-    def hear_positions(self, hears: Tensor) -> None:
-        """Enters the positions of the UAVs (column) that a UAV (row) hears, bool [envs, n, n]."""
-        stamp, place = (x.diagonal(dim1=1, dim2=2) for x in (self.stamp, self.place))
-        self.stamp.copy_(torch.where(hears, stamp.unsqueeze(1), self.stamp))
-        self.place.copy_(torch.where(hears.unsqueeze(-1), place.mT.unsqueeze(1), self.place))
+    def hear_positions(self, hears: Tensor, step: Tensor, place: Tensor) -> None:
+        """Enters positions that UAVs have heard.
+
+        Args:
+            hears: bool [envs, n, n], the UAVs (column) that a UAV hears.
+            step: int64 [envs], when they said where they were.
+            place: float32 [envs, n, 3], cells.
+        """
+        stamps = self._stamps()
+        stamps.copy_(torch.where(hears, self._first_of(step), stamps))
+        self.place.copy_(torch.where(hears.unsqueeze(-1), place.unsqueeze(1), self.place))
+
+    def _first_of(self, step: Tensor) -> Tensor:
+        """Returns the lowest number in a map of each step, int64 [envs, 1, 1]."""
+        # Beyond the horizon, a step that does not fit into the map counts as the last that does.
+        latest = torch.iinfo(self.known.last_seen.dtype).max >> 2
+        return 4 * step.clamp(max=latest).view(-1, 1, 1)
 
     def show(self, tensordict: TensorDictBase, due: Tensor) -> None:
         """Writes the pictures; draws those of the environments of a mask, bool [envs]."""
@@ -114,7 +138,7 @@ class BeliefMaps(nn.Module):
             The step, integers [envs, n, X, Y], -1 for never, and the cell's state then: 0 no fire,
             1 fire, 2 burnt out; 3 for never.
         """
-        known = self.sensor.crop(self.known.last_seen)
+        known = self.sensor.crop(self.looks)
         return known >> 2, known & 3
 
     def _draw(self, tensordict: TensorDictBase, env: Tensor) -> Tensor:
@@ -128,8 +152,8 @@ class BeliefMaps(nn.Module):
         base = self._base.expand(len(env), uavs, *self._base.shape)
         step = tensordict.get(keys.STEP)[env].unsqueeze(-1).expand(-1, uavs)
         drawn = self.pictures.draw(
-            self.sensor.crop(self.known.last_seen[env]).flatten(0, 1),
-            self.sensor.crop(seen[env]).flatten(0, 1),
+            self.sensor.crop(self.looks[env]).flatten(0, 1),
+            self.sensor.crop(seen[env, :, : self.sensor.area]).flatten(0, 1),
             step.flatten(),
             centre.flatten(0, 1),
             tuple(x.flatten(0, 1) for x in (others, heard, base)),

@@ -40,7 +40,8 @@ class CommModule(TensorDictModuleBase):
     checkpoint and must hold finite numbers. Constants are registered with `persistent=False`.
 
     If `hears` is true, the links of each step, by the radio of the world (`env.radio`), are written
-    under `keys.HEARS` before `shaping` and `forward` are called.
+    under `keys.HEARS` before `shaping` and `forward` are called. What is sent over them arrives
+    `env.radio.delay` steps later (`radio.Late`).
 
     Args:
         world: the environment's constants.
@@ -52,8 +53,9 @@ class CommModule(TensorDictModuleBase):
     """a pydantic dataclass: the settings under `comm` in a method's YAML file"""
     hears: ClassVar[bool] = False
     """whether the module reads `keys.HEARS`"""
-    heeds_bandwidth: ClassVar[bool] = False
-    """whether UAVs say no more than `env.radio.bandwidth`; if not, a limit causes a warning"""
+    heeds_packets: ClassVar[bool] = False
+    """whether messages heed `env.radio.delay` and `env.radio.bandwidth`; if not, they cause a
+    warning"""
     every_step: bool = True
     """whether the module takes part in every step of a held action, not only at decisions; without
     it, a module neither shapes nor steers, and each step sends the bytes of the decision"""
@@ -62,6 +64,8 @@ class CommModule(TensorDictModuleBase):
     hold: int = 1
     """steps from one decision of the policy to the next (`policy.hold`); between them, no policy
     reads observations"""
+    reserved: int = 0
+    """bytes of a learned message, which comes before what the module says at a decision"""
     maps: BeliefMaps | None
     """with `observation: map`, what each UAV knows: `forward` may enter what UAVs hear"""
 
@@ -146,6 +150,19 @@ class CommModule(TensorDictModuleBase):
             self.maps.show(tensordict, tensordict.get(keys.STEP) % self.hold == 0)
         return tensordict
 
+    def budget(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Returns the bytes that each UAV can say at a step, int64 [num_envs, n].
+
+        Negative for a UAV whose learned message does not fit, None without a limit.
+        """
+        config = self.world.radio
+        if config.bandwidth is None:
+            return None
+        place, alive = tensordict.get(keys.POSITION), tensordict.get(keys.ALIVE)
+        left = radio.budget(config, radio.in_range(config, place, alive))
+        decides = tensordict.get(keys.STEP).unsqueeze(-1) % self.hold == 0
+        return None if left is None else left - self.reserved * decides
+
     @property
     def counts(self) -> bool:
         """Whether the bytes that UAVs send are measured."""
@@ -181,6 +198,8 @@ class Communication(Transform):
         super().__init__()
         self.module, self.message_bytes, self._joined = module, message_bytes, False
         self.listens = module.hears or message_bytes > 0
+        module.reserved = message_bytes
+        self.channel = radio.Channel(module.world, module.num_envs)
         for name, buffer in module.state_dict().items():
             if buffer.shape[:1] != (module.num_envs,):
                 raise ValueError(
@@ -194,6 +213,7 @@ class Communication(Transform):
         world: Any = None if self.parent is None else self.parent.base_env
         # Bytes of learned messages are counted at decisions, and not at every step.
         counted = self.message_bytes > 0 and self.module.world.measures == "all"
+        counted |= self.module.world.reports
         takes_part = self.module.every_step or counted or self.module.maps is not None
         self._joined = getattr(world, "hold", 1) > 1 and takes_part
         if self._joined:
@@ -268,8 +288,9 @@ class Communication(Transform):
         if self.listens:
             at = (of_steps(steps, key) for key in (keys.POSITION, keys.RNG_KEY, keys.STEP))
             alive = of_steps(steps, keys.ALIVE) if world.failures else None
-            for step, links in zip(steps, radio.links(world.radio, *at, alive=alive), strict=True):
-                step.set(keys.HEARS, links)
+            for step, links in zip(steps, self.channel(*at, alive), strict=True):
+                left = self.module.budget(step) if self.message_bytes else None
+                step.set(keys.HEARS, links if left is None else links & (left >= 0).unsqueeze(-2))
 
     def _bytes(self, steps: Sequence[TensorDictBase], sent: Tensor | None) -> dict[Any, Tensor]:
         """Returns the bytes that the UAVs send, in a world in which they are measured."""
@@ -278,9 +299,13 @@ class Communication(Transform):
             return {}
         alive = of_steps(steps, keys.ALIVE)
         total = torch.zeros_like(alive, dtype=torch.int64) if sent is None else sent * alive
+        if world.reports:
+            total = total + of_steps(steps, keys.REPORT_BYTES)
         if self.message_bytes and world.radio.range:
-            decides = of_steps(steps, keys.STEP) % self.module.hold == 0
-            total = total + self.message_bytes * (alive & decides.unsqueeze(-1))
+            says = alive & (of_steps(steps, keys.STEP) % self.module.hold == 0).unsqueeze(-1)
+            if world.radio.bandwidth is not None:
+                says &= torch.stack([self.module.budget(step) >= 0 for step in steps])
+            total = total + self.message_bytes * says
         return {keys.BYTES_SENT: total}
 
     def _check_keys(self, tensordict: TensorDictBase) -> None:

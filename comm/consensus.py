@@ -17,11 +17,13 @@ from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.utils.validation import STRICT
 from emberlink.envs.world import motion
-from emberlink.envs.world.radio import pairwise_distance, reachable
+from emberlink.envs.world.radio import Late, pairwise_distance, reachable
 from emberlink.envs.world.reward import left_box
 
 RECORD_BYTES = 16
 """position and rank of a discoverer, four float32 numbers"""
+LATE_BYTES = 4
+"""more of a record where messages are late or limited: the discoverer and the step"""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -88,6 +90,7 @@ class Consensus(CommModule):
 
     config_type: ClassVar[type] = ConsensusConfig
     hears: ClassVar[bool] = True
+    heeds_packets: ClassVar[bool] = True
     units: ClassVar[tuple[str, ...]] = ("target",)
     low: Tensor
     high: Tensor
@@ -105,6 +108,13 @@ class Consensus(CommModule):
     """bool [num_envs, n]: whether a UAV was a wanderer at the previous time step"""
     old_fire_only: Tensor
     """bool [num_envs, n]: whether a UAV was a discoverer without new fire at that step"""
+    newest: Tensor
+    """int64 [num_envs, n, n]: step of the newest record that a UAV has had of another one, or -1"""
+    received: Tensor
+    """float64 [num_envs, n, n, 5]: newer records of UAVs that a UAV received at the last step: step
+    (-1 for none), position and rank"""
+    said: Tensor
+    """int64 [num_envs, n]: the bytes that each UAV said at the last step"""
 
     def __init__(self, world: WildfireConfig, config: ConsensusConfig, num_envs: int = 1):
         super().__init__(world, config, num_envs)
@@ -122,6 +132,14 @@ class Consensus(CommModule):
         for name in ("leaderless", "old_fire_only"):
             self.register_buffer(name, torch.zeros(agents, dtype=torch.bool))
         self.register_buffer("altitude_sum", torch.zeros(agents, dtype=torch.float64))
+        if world.radio.packets:
+            pairs, delay = (world.num_uavs, world.num_uavs), (world.radio.delay, num_envs)
+            self.links = Late(*delay, torch.tensor(False), *pairs)
+            self.records = Late(*delay, torch.tensor(-1.0, dtype=torch.float64), *pairs, 5)
+            self.register_buffer("newest", torch.full((num_envs, *pairs), -1))
+            nothing = torch.full((num_envs, *pairs, 5), -1.0, dtype=torch.float64)
+            self.register_buffer("received", nothing)
+            self.register_buffer("said", torch.zeros(agents, dtype=torch.int64))
 
     def specs(self, observation: Composite) -> Composite:
         shape, device = observation[keys.AGENTS].shape, observation.device
@@ -144,6 +162,9 @@ class Consensus(CommModule):
         self.waypoint.copy_(torch.where(mask[:, None, None], points, self.waypoint))
         for record in (self.fire_score, self.altitude_sum):
             record.masked_fill_(mask[:, None], 0)
+        if self.world.radio.packets:
+            self.newest[mask] = -1
+            self.received[mask] = -1.0
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self._rewrite([tensordict]).last
@@ -160,21 +181,32 @@ class Consensus(CommModule):
         """Rewrites the last time step; what depends on the step before is computed in turn."""
         read, last = TimeSteps.of(steps), steps[-1]
         discovers = self._discovers(read.new_fire, read.old_fire)
-        known = known_discoverers(read.hears, discovers, agree=self.config.agree)
-        best = self.config.follow == "best"
         rank = self._update_track_record(read, discovers)
-        cost = -rank.unsqueeze(-2) if best else pairwise_distance(read.position)
+        best = self.config.follow == "best"
+        if self.world.radio.packets:
+            budgets = [self.budget(step) for step in steps]
+            known, records, sent = self._converse(read, discovers, rank, budgets)
+            places = records[..., 1:4].float()
+            cost = (
+                -records[..., 4] if best else motion.distance(read.position.unsqueeze(-2), places)
+            )
+        else:
+            known = known_discoverers(read.hears, discovers, agree=self.config.agree)
+            places = read.position.unsqueeze(-3).expand(*known.shape, 3)
+            cost = -rank.unsqueeze(-2) if best else pairwise_distance(read.position)
+            sent = self._bytes(discovers, known)
         follows = choose_leader(known, cost, discovers)
-        target = self._targets(read, discovers, follows)
+        target = self._targets(read, discovers, follows, places)
         bonus = self._bonus(read, discovers, follows, target)
-        sent = self._bytes(discovers, known) if self.counts else None
         relative = self.config.target == "relative"
         shown = self._scaled(target[-1] - read.position[-1] if relative else target[-1])
         last.set(keys.OBSERVATION, torch.cat((last.get(keys.OBSERVATION), shown), -1))
         last.set(keys.FOLLOWS, follows[-1]).set(keys.TARGET, target[-1])
-        return Heard(last, bonus, sent)
+        return Heard(last, bonus, sent if self.counts else None)
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
+        if self.world.radio.packets:
+            return self.said.clone()
         fire = (tensordict.get(key) for key in (keys.NEW_FIRE, keys.OLD_FIRE))
         discovers = self._discovers(*fire)
         known = known_discoverers(tensordict.get(keys.HEARS), discovers, agree=self.config.agree)
@@ -187,6 +219,47 @@ class Consensus(CommModule):
         """
         passed_on = known.sum(-1) * self.config.agree
         return RECORD_BYTES * torch.where(discovers, 1, passed_on)
+
+    def _converse(
+        self, steps: TimeSteps, discovers: Tensor, rank: Tensor, budgets: Sequence[Tensor | None]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Passes on records of discoverers, one link a step.
+
+        A discoverer says its own record. Other UAVs pass on the newer records that they received
+        at the step before, those of the highest rank first.
+
+        Returns:
+            The discoverers of whom each UAV receives a newer record, bool [steps, num_envs, n, n];
+            these records, see `received`; and the bytes of each UAV, int64 [steps, num_envs, n].
+        """
+        uavs, size = discovers.shape[-1], RECORD_BYTES + LATE_BYTES
+        own = torch.eye(uavs, dtype=torch.bool, device=discovers.device)
+        known, records, sent = [], [], []
+        for number, (finds, now) in enumerate(zip(discovers, steps.step, strict=True)):
+            stamp = now.view(-1, 1, 1).expand(-1, uavs, 1).double()
+            mine = torch.cat((stamp, steps.position[number], rank[number].unsqueeze(-1)), -1)
+            says = torch.where(finds.unsqueeze(-1), own, self.received[..., 0] >= 0)
+            says &= finds.unsqueeze(-1) | self.config.agree
+            record = torch.where(own.unsqueeze(-1), mine.unsqueeze(1), self.received)
+            left = budgets[number]
+            if left is not None:
+                order = record[..., 4].masked_fill(~says, -torch.inf).argsort(-1, descending=True)
+                says &= order.argsort(-1) < (left // size).unsqueeze(-1)
+            self.said.copy_(size * says.sum(-1))
+            heard = self.records(now, torch.where(says.unsqueeze(-1), record, -1.0))
+            links = self.links(now, steps.hears[number])
+            # [num_envs, hearers, speakers, discoverers]
+            told = torch.where(links.unsqueeze(-1), heard[..., 0].unsqueeze(1), -1.0)
+            told, speaker = told.masked_fill(own.unsqueeze(-2), -1.0).max(2)
+            told = told.long()
+            new = told > self.newest
+            self.newest.copy_(torch.maximum(self.newest, told))
+            found = heard.gather(1, speaker.unsqueeze(-1).expand(*speaker.shape, 5))
+            self.received.copy_(torch.where(new.unsqueeze(-1), found, -1.0))
+            known.append(new)
+            records.append(self.received.clone())
+            sent.append(self.said.clone())
+        return torch.stack(known), torch.stack(records), torch.stack(sent)
 
     def _discovers(self, new_fire: Tensor, old_fire: Tensor) -> Tensor:
         """Returns whether each UAV is a discoverer, bool [..., n]."""
@@ -202,15 +275,21 @@ class Consensus(CommModule):
             records.append(self.fire_score / self.altitude_sum.clamp(min=1e-9))
         return torch.stack(records) * (discovered / altitude)
 
-    def _targets(self, steps: TimeSteps, discovers: Tensor, follows: Tensor) -> Tensor:
-        """Returns the targets, float32 [steps, num_envs, n, 3]."""
+    def _targets(
+        self, steps: TimeSteps, discovers: Tensor, follows: Tensor, places: Tensor
+    ) -> Tensor:
+        """Returns the targets, float32 [steps, num_envs, n, 3].
+
+        Args:
+            places: float32 [steps, num_envs, n, n, 3], of UAVs as each UAV (row) has heard of them.
+        """
         position = steps.position
         wanders = (follows < 0).unsqueeze(-1)
         alone = self._wander(steps, wanders) if self.config.wander else position
         new = (steps.new_fire > 0).unsqueeze(-1)
         centre = torch.where(new, steps.new_centre, steps.old_centre)
-        leader = follows.clamp(min=0).unsqueeze(-1).expand_as(position)
-        target = torch.where(wanders, alone, position.gather(-2, leader))
+        leader = follows.clamp(min=0)[..., None, None].expand(*follows.shape, 1, 3)
+        target = torch.where(wanders, alone, places.gather(-2, leader).squeeze(-2))
         over_fire = torch.cat((centre, position[..., 2:]), -1)
         target = torch.where(discovers.unsqueeze(-1), over_fire, target)
         return self._jittered(steps, target) if self.config.jitter else target

@@ -8,21 +8,13 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from emberlink.comm._belief import BeliefMaps
-from emberlink.comm._messages import (
-    CellMessages,
-    cell_bytes,
-    offers,
-    pass_on_places,
-    place_bytes,
-    place_gain,
-    said_within,
-)
 from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import STRICT
 from emberlink.envs.world import motion, radio
+from emberlink.envs.world.exchange import Exchange, cell_bytes, step_bytes
 
 _DIAGONAL = 2**0.5  # greatest distance over the ground that a unit of action leads
 
@@ -31,6 +23,9 @@ _DIAGONAL = 2**0.5  # greatest distance over the ground that a unit of action le
 class MapsConfig:
     """Stores the settings under `comm`."""
 
+    acknowledge: bool = False
+    """whether UAVs know of each other only what they hear, and acknowledge messages; without it,
+    they do so only where the radio is late or limited"""
     home: bool = False
     """whether UAVs fly to a chain of radios to the base in time, whatever the policy does; without
     a base, and without a radio that reaches it, they do not"""
@@ -40,9 +35,7 @@ class Maps(CommModule):
     """Passes on what the UAVs' belief maps hold.
 
     At each step, a UAV sends the cells and the positions of UAVs that are new to a UAV in range;
-    received messages are passed on at the next step. With a limit of bytes, the highest gain is
-    sent first. With a limit, a sender chooses by the maps of all UAVs in range, so what one of them
-    receives may depend on the maps of the others.
+    received messages are passed on at the next step (`Exchange`).
 
     With `home` and a base, a UAV leaves for its place in a chain of radios from the base to the
     fire that it knows when it would otherwise come too late (`steer`).
@@ -53,7 +46,7 @@ class Maps(CommModule):
 
     config_type: ClassVar[type] = MapsConfig
     hears: ClassVar[bool] = True
-    heeds_bandwidth: ClassVar[bool] = True
+    heeds_packets: ClassVar[bool] = True
     maps: BeliefMaps  # pyright: ignore[reportIncompatibleVariableOverride]
     said: Tensor
     """int64 [num_envs, n]: the bytes said at the last step"""
@@ -70,8 +63,13 @@ class Maps(CommModule):
             )
         inputs: list[Any] = [keys.POSITION, keys.HEARS, keys.ALIVE, keys.STEP]
         self.in_keys = inputs
-        agents, size = (num_envs, world.num_uavs), cell_bytes(world.horizon)
-        self.messages = CellMessages(*agents, self.maps.sensor.area, size)
+        agents, area = (num_envs, world.num_uavs), self.maps.sensor.area
+        self.area, later = area, world.radio.delay
+        sizes = torch.full((area + world.num_uavs,), cell_bytes(world.horizon))
+        sizes[area:] = 2 + step_bytes(world.horizon) + 12  # UAV, step, three float32 numbers
+        free = not (world.radio.packets or config.acknowledge)
+        self.messages = Exchange(world.radio, sizes, agents, unit=4, free=free)
+        self.places = radio.Late(later, num_envs, torch.tensor(0.0), *agents[1:] * 2, 3)
         self.register_buffer("home", torch.zeros(*agents, 3, dtype=torch.float32))
         self.register_buffer("said", torch.zeros(agents, dtype=torch.int64))
         base = torch.tensor(world.base or (0.0, 0.0), dtype=torch.float32)
@@ -83,7 +81,6 @@ class Maps(CommModule):
         self.messages.start_episodes(mask)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self.messages.saw(self.maps.view)
         self._talk(tensordict)
         env = (tensordict.get(keys.STEP) % self.hold == 0).nonzero().squeeze(-1)
         if self._brings_home and len(env):
@@ -107,26 +104,21 @@ class Maps(CommModule):
 
     def _talk(self, tensordict: TensorDictBase) -> None:
         """Exchanges messages between UAVs in range, and counts the bytes."""
-        near = hears = tensordict.get(keys.HEARS)
-        settings, limit, maps = self.world.radio, self.world.radio.bandwidth, self.maps
-        if settings.loss:
-            place, alive = tensordict.get(keys.POSITION), tensordict.get(keys.ALIVE)
-            near = radio.in_range(settings, place, alive)
-        news = self.messages.compare(maps.known, near)
-        said_cells = said_places = None
-        sizes = self.messages.size, place_bytes(self.world.horizon)
-        if limit is not None:
-            cells = offers(maps.known, news, limit // sizes[0])
-            places = place_gain(maps.stamp, near)
-            area = maps.sensor.area
-            said_cells, said_places = said_within(limit, cells, places, area, sizes)
-        spoken = self.messages.pass_on(maps.known, near, hears, news, said_cells)
-        spoken += pass_on_places(maps.stamp, maps.place, near, hears, said_places, sizes[1])
-        self.said.copy_(spoken)
+        maps, alive, step = self.maps, tensordict.get(keys.ALIVE), tensordict.get(keys.STEP)
+        self.messages.saw(maps.view)
+        near = radio.in_range(self.world.radio, tensordict.get(keys.POSITION), alive)
+        sent, _, new = self.messages(
+            maps.known, near, tensordict.get(keys.HEARS), step, self.budget(tensordict)
+        )
+        places = self.places(step, maps.place.clone())
+        env, hearer, speaker, entry = new[:, new[3] >= self.area]
+        uav = entry - self.area
+        maps.place[env, hearer, uav] = places[env, speaker, uav]
+        self.said.copy_(sent)
 
     def _find_home(self, tensordict: TensorDictBase, env: Tensor) -> Tensor:
         """Returns the place and reach of UAVs in a chain to the fire, float32 [len(env), n, 3]."""
-        known = self.maps.sensor.crop(self.maps.known.last_seen[env])
+        known = self.maps.sensor.crop(self.maps.looks[env])
         burning = (known >= 0) & (known & 3 == 1)
         step, heard = tensordict.get(keys.STEP)[env], self.maps.stamp[env].clamp(min=0)
         place, reach = radio.chain_to_fire(self.world, self._base, burning, step, heard)

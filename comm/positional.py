@@ -12,6 +12,7 @@ from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.validation import STRICT
+from emberlink.envs.world.radio import Late
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -33,6 +34,7 @@ class Positional(CommModule):
 
     config_type: ClassVar[type] = PositionalConfig
     hears: ClassVar[bool] = True
+    heeds_packets: ClassVar[bool] = True
     units: ClassVar[tuple[str, ...]] = ("own_first",)
 
     _own: Tensor
@@ -41,9 +43,14 @@ class Positional(CommModule):
 
     def __init__(self, world: WildfireConfig, config: PositionalConfig, num_envs: int = 1):
         super().__init__(world, config, num_envs)
-        inputs: list[Any] = [keys.OBSERVATION, keys.HEARS]
+        inputs: list[Any] = [keys.OBSERVATION, keys.POSITION, keys.HEARS, keys.ALIVE, keys.STEP]
         self.in_keys = inputs
-        self.every_step = world.measures == "all"  # UAVs that fail send nothing from then on
+        self.numbers = len(keys.FEATURES if self.maps is None else "xyz")
+        sent = world.radio.delay, num_envs
+        self.links = Late(*sent, torch.tensor(False), *[world.num_uavs] * 2)
+        self.said = Late(*sent, torch.tensor(0.0), world.num_uavs, self.numbers)
+        # UAVs that fail send nothing from then on, and late messages may be of any step.
+        self.every_step = world.measures == "all" or world.radio.delay > 0
         own = torch.eye(world.num_uavs, dtype=torch.bool)
         self.register_buffer("_own", own, persistent=False)
         uav = torch.arange(world.num_uavs)
@@ -61,12 +68,20 @@ class Positional(CommModule):
         return observation
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        step, key = (
+            tensordict.get(keys.STEP),
+            keys.OBSERVATION if self.maps is None else keys.POSITION,
+        )
+        vectors, hears = tensordict.get(key), tensordict.get(keys.HEARS)
+        left = self.budget(tensordict)
+        if left is not None:
+            hears = hears & (left >= 4 * self.numbers).unsqueeze(-2)
+        hears, heard = self.links(step, hears), self.said(step, vectors)
         if self.maps is not None:
-            self.maps.hear_positions(tensordict.get(keys.HEARS))
+            self.maps.hear_positions(hears, step - self.world.radio.delay, heard)
             return tensordict
-        vectors = tensordict.get(keys.OBSERVATION)
-        known = (tensordict.get(keys.HEARS) | self._own).unsqueeze(-1)
-        joined = torch.where(known, vectors.unsqueeze(-3), 0.0)
+        joined = torch.where(hears.unsqueeze(-1), heard.unsqueeze(-3), 0.0)
+        joined = torch.where(self._own.unsqueeze(-1), vectors.unsqueeze(-3), joined)
         if self.config.own_first:
             pairs = joined.flatten(-3, -2).index_select(-2, self._order)
             joined = pairs.unflatten(-2, joined.shape[-3:-1])
@@ -74,5 +89,6 @@ class Positional(CommModule):
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
         """Returns 24 for each UAV, the six float32 numbers of its vector; 12 for a position."""
-        said = keys.FEATURES if self.maps is None else "xyz"
-        return torch.full_like(tensordict.get(keys.HEARS)[..., 0], 4 * len(said), dtype=torch.int64)
+        size, left = 4 * self.numbers, self.budget(tensordict)
+        sent = torch.full_like(tensordict.get(keys.HEARS)[..., 0], size, dtype=torch.int64)
+        return sent if left is None else sent * (left >= size)

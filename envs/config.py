@@ -42,9 +42,22 @@ class RadioConfig:
     """radios at a distance below this hear each other, cells; 0 turns them off, inf is no limit"""
     loss: Annotated[float, Field(ge=0, le=1)] = 0.0
     """probability that a radio does not hear another one in a step, each direction independently"""
+    burst: Annotated[float, Field(ge=1, le=1_000_000)] = 1.0
+    """mean length of a spell in which a radio does not hear another one, steps; at 1, and up to
+    1 / (1 - loss), losses are independent"""
+    fade: bool = False
+    """whether messages are lost, too, with a probability that rises with the distance"""
+    delay: Annotated[int, Field(ge=0, le=1000)] = 0
+    """steps from sending a message to receiving it"""
     bandwidth: Annotated[int, Field(ge=0, le=1_000_000_000)] | None = None
-    """bytes that a UAV can say to other UAVs in a step, for methods that heed it; None for no
-    limit"""
+    """bytes that a UAV can say in a step; None for no limit"""
+    shared: bool = False
+    """whether radios in range of each other share the bandwidth"""
+
+    @property
+    def packets(self) -> bool:
+        """Whether messages go one link at a time, as they are late or limited."""
+        return self.delay > 0 or self.bandwidth is not None
 
 
 LARGEST_SCALE = 16
@@ -143,6 +156,11 @@ class WildfireConfig:
         if self.altitude[0] > self.altitude[1]:
             raise UserError(f"altitude {self.altitude}: the lowest is above the highest")
         return self
+
+    @property
+    def reports(self) -> bool:
+        """Whether the bytes that UAVs tell the base are counted."""
+        return self.base is not None and self.measures == "all" and self.radio.packets
 
     @property
     def low(self) -> tuple[float, float, float]:

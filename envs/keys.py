@@ -56,6 +56,9 @@ ALIVE: Final = (AGENTS, "alive")
 move and gets no reward."""
 BYTES_SENT: Final = (AGENTS, "bytes_sent")
 """int64 [...]: bytes that the UAV sent at this step. Written by communication."""
+REPORT_BYTES: Final = (AGENTS, "report_bytes")
+"""int64 [...]: the part of them for the base. Only with a base, `measures: all` and a radio that is
+late or limited; `BYTES_SENT` contains them."""
 
 RNG_KEY: Final = "rng_key"
 """int64 [num_envs]: the key of this episode's random numbers (`envs.utils.counter_rng`)."""

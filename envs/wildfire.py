@@ -43,6 +43,8 @@ class Moved(NamedTuple):
     """None at a reset"""
     base_seen: Tensor | None = None
     """None at a reset, and without a base"""
+    said: Tensor | None = None
+    """bytes for the base; None at a reset, and where they are not counted"""
 
 
 def _last(part: Any) -> Any:
@@ -177,6 +179,8 @@ class WildfireEnv(EnvBase):
             per_uav[keys.WINDOW[1]] = flag(*agents, 3, side, side)
         if world.observation == "map":
             per_uav[keys.SIGHT[1]] = byte(*agents, side, side)
+        if world.reports:
+            per_uav[keys.REPORT_BYTES[1]] = whole(*agents)
         observed = team(**per_uav)
         for key in (keys.RNG_KEY, keys.STEP, keys.SEEN, keys.BURNING, keys.BURNT):
             observed[key] = whole(*envs)
@@ -313,17 +317,19 @@ class WildfireEnv(EnvBase):
         position, hit_boundary = map(torch.stack, zip(*moves, strict=True))
         burning, burnt = self._map.count(time)
         look = self._map.look(position.double(), self._step_key, time, burning, alive)
-        told = base_seen = None
+        told = base_seen = said = None
         if self._measures is not None:
             at = position, self._step_key, time, alive, burnt
-            told, base_seen = self._measures.update(look.view, look.ended, self._map.times, *at)
+            told, base_seen, said = self._measures.update(
+                look.view, look.ended, self._map.times, *at
+            )
         new, old, none = look.counts.unbind(-1)
         flies = self._all_alive if alive is None else alive
         penalised = self.config.reward.unseen != 0
         unseen = look.unseen.unsqueeze(-1) * flies if penalised else None
         reward = step_reward(new, old, none, hit_boundary, self.config.reward, told, unseen)
         self._time.copy_(time[-1])
-        counts = look.seen, burning, burnt, reward.unsqueeze(-1), base_seen
+        counts = look.seen, burning, burnt, reward.unsqueeze(-1), base_seen, said
         return Moved(time, alive, position, hit_boundary, look.shown, *counts)
 
     def _alive(self, time: Tensor) -> Tensor | None:
@@ -362,6 +368,9 @@ class WildfireEnv(EnvBase):
             agents[keys.WINDOW[1]] = sighting.classes.unflatten(-1, square)
         if self.config.observation == "map":
             agents[keys.SIGHT[1]] = sighting.shown().unflatten(-1, square)
+        if self.config.reports:
+            nothing = torch.zeros_like(flies, dtype=torch.int64)
+            agents[keys.REPORT_BYTES[1]] = nothing if now.said is None else now.said
         if now.reward is not None:
             agents[keys.REWARD[1]] = now.reward
         done = self._done(time)

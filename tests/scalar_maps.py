@@ -4,7 +4,6 @@ import math
 from fractions import Fraction
 
 FULL = 255
-OLD = 100
 
 
 def rounded(value) -> int:
@@ -83,29 +82,23 @@ class Teller:
             if code == 1:
                 self.fires[uav].add(cell)
 
-    def talk(self, near, hears, limit=None, sizes=(5, 16), area=0) -> list[tuple[int, int]]:
+    def talk(self, near, hears) -> list[tuple[int, int]]:
         """Passes on new cells and positions, and returns their numbers for each UAV.
 
-        Messages depend on the UAVs in range; only hearers receive them. With a limit, `area` is the
-        number of cells of the map.
+        Messages depend on the UAVs in range; only hearers receive them.
         """
         looks, fires = [dict(m) for m in self.looks], [set(m) for m in self.fires]
         places, counts = [dict(m) for m in self.places], []
         for speaker, mine in enumerate(looks):
-            worth = {}
+            said = set()
             for uav in (k for k in range(len(looks)) if near[k][speaker]):
                 for cell, look in mine.items():
-                    theirs = looks[uav].get(cell, (-1, -1))
-                    fire_is_new = cell in fires[speaker] and cell not in fires[uav]
-                    if look > theirs or fire_is_new:
-                        gained = min(OLD, look[0] - (-1 if fire_is_new else theirs[0]))
-                        worth["cell", cell] = worth.get(("cell", cell), 0) + gained
+                    newer = look > looks[uav].get(cell, (-1, -1))
+                    if newer or (cell in fires[speaker] and cell not in fires[uav]):
+                        said.add(("cell", cell))
                 for other, step in places[speaker].items():
-                    gained = step - places[uav].get(other, -1)
-                    if gained > 0:
-                        worth["place", other] = worth.get(("place", other), 0) + gained
-            turn = speaker * (area // len(looks))
-            said = set(worth) if limit is None else within(limit, worth, sizes, turn, area)
+                    if step > places[uav].get(other, -1):
+                        said.add(("place", other))
             counts.append(tuple(sum(k == kind for k, _ in said) for kind in ("cell", "place")))
             for uav in (k for k in range(len(looks)) if hears[k][speaker]):
                 for kind, what in said:
@@ -118,25 +111,3 @@ class Teller:
                         if what in fires[speaker]:
                             self.fires[uav].add(what)
         return counts
-
-
-def within(limit: int, worth: dict, sizes: tuple[int, int], turn: int, area: int) -> set:
-    """Returns the entries said: the best that fit together, and then cells.
-
-    Of equal worth, cells come first, in the order of their indices plus `turn`, modulo `area`.
-    """
-    size = {"cell": sizes[0], "place": sizes[1]}
-
-    def rank(item) -> tuple:
-        kind, number = item
-        return -worth[item], kind == "place", (number + turn) % area if kind == "cell" else number
-
-    ranked = sorted(worth, key=rank)
-    said, left = set(), limit
-    for number, item in enumerate(ranked):
-        if size[item[0]] > left:
-            more = [k for k in ranked[number:] if k[0] == "cell"]
-            return said | set(more[: left // sizes[0]])
-        said.add(item)
-        left -= size[item[0]]
-    return said

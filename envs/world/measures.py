@@ -1,15 +1,17 @@
 """Measures the sightings of the team and of the base at each step."""
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.world import radio
 from emberlink.envs.world.coverage_map import View
+from emberlink.envs.world.exchange import Exchange, cell_bytes, share
 from emberlink.envs.world.knowledge import Knowledge, step_type
+from emberlink.envs.world.radio import Channel
 
 _EXACT = 512
 """ages below are counted one by one"""
@@ -175,12 +177,13 @@ class Measures(nn.Module):
     """int64 [envs]: number of cells that have ignited"""
     base_seen: Tensor
     """int64 [envs]: number of cells with a sighting in flames at the base"""
-    _base: Tensor
+    said: Tensor
+    """int64 [envs, uavs]: bytes that UAVs said for the base at the last step"""
 
     def __init__(self, world: WildfireConfig, envs: int, area: int):
         super().__init__()
         self._world, self._area = world, area
-        self.knowledge = self.base_ages = self.ages = None
+        self.knowledge = self.base_ages = self.ages = self.reports = None
         self.register_buffer("burnt", torch.zeros(envs, dtype=torch.int64))
         if world.measures == "all":
             self.ages = SightingAges(envs, area, world.horizon)
@@ -195,8 +198,11 @@ class Measures(nn.Module):
             )
             self.base_ages = SightingAges(envs, area, world.horizon)
             self.register_buffer("base_seen", torch.zeros(envs, dtype=torch.int64))
-            base = torch.tensor([[*world.base, 0.0]], dtype=torch.float64)
-            self.register_buffer("_base", base.repeat(envs, 1, 1), persistent=False)
+            self.channel = Channel(world, envs, base=True)
+            sizes = torch.full((area,), cell_bytes(world.horizon))
+            if world.radio.packets:
+                self.register_buffer("said", torch.zeros(envs, world.num_uavs, dtype=torch.int64))
+                self.reports = Exchange(world.radio, sizes, (envs, world.num_uavs + 1))
 
     def start_episodes(self, mask: Tensor, arrival: Tensor, burning: Tensor, burnt: Tensor) -> None:
         """Starts new episodes in the environments of a mask, bool [envs].
@@ -213,6 +219,8 @@ class Measures(nn.Module):
                 part.start_episodes(mask, ignition, burning)
         if self.knowledge is not None:
             self.knowledge.start_episodes(mask)
+            if self.reports is not None:
+                self.reports.start_episodes(mask)
             self.base_seen.masked_fill_(mask, 0)
 
     def update(
@@ -225,7 +233,7 @@ class Measures(nn.Module):
         step: Tensor,
         alive: Tensor | None,
         burnt: Tensor,
-    ) -> tuple[Tensor | None, Tensor | None]:
+    ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
         """Adds successive steps.
 
         Args:
@@ -241,7 +249,7 @@ class Measures(nn.Module):
         Returns:
             The burnt cells new to the base at each step, for UAVs whose messages arrived there,
             else 0, int64 [steps, envs, uavs], and `base_seen` after each, int64 [steps, envs];
-            None without a base.
+            None without a base; and the bytes that each UAV says, like the first, if counted.
         """
         ignited = burnt.diff(dim=0, prepend=self.burnt.unsqueeze(0))
         self.burnt.copy_(burnt[-1])
@@ -254,22 +262,26 @@ class Measures(nn.Module):
             events = number_events(seen, cell * steps + row // envs)
             self.ages.add(step, ignited, events)
         if self.knowledge is None:
-            return None, None
-        told, known = [], []
+            return None, None, None
+        told, known, said = [], [], []
         for number, now in enumerate(step):
             looks = View(*(part[number] for part in view))
             flies = None if alive is None else alive[number]
-            hears = self.hears(position[number].double(), rng_key, now, flies)
+            place = position[number].double()
+            near = self.channel.in_range(place, flies)
+            links = near, self.channel(place, rng_key, now, flies)
             gone = cell[row // envs == number]
-            told.append(self._report(looks, now, hears, ignited[number], gone, times))
+            told.append(self._report(looks, now, links, ignited[number], gone, times))
             known.append(self.base_seen.clone())
-        return torch.stack(told), torch.stack(known)
+            if self._world.reports:
+                said.append(self.said * (1 if flies is None else flies))
+        return torch.stack(told), torch.stack(known), torch.stack(said) if said else None
 
     def _report(
         self,
         view: View,
         step: Tensor,
-        hears: Tensor,
+        links: Any,
         ignited: Tensor,
         ended: Tensor,
         times: tuple[Tensor, Tensor | None],
@@ -280,7 +292,9 @@ class Measures(nn.Module):
         assert ages is not None
         assert knowledge.seen_fire is not None
         before = knowledge.last_seen[:, -1].clone()
-        knowledge.update(view, step, hears)
+        sent = share(knowledge, self.reports, view, step, *links)
+        if sent is not None:
+            self.said.copy_(sent[:, :-1])
         after, now = knowledge.last_seen[:, -1].clone(), step.unsqueeze(-1)
         arrival, burn_out = times
         newer = (after > before) & (after > ages.since) & (arrival <= now)
@@ -292,16 +306,6 @@ class Measures(nn.Module):
         told = (seen - self.base_seen).unsqueeze(-1) * knowledge.reach[:, -1, :-1]
         self.base_seen.copy_(seen)
         return told
-
-    def hears(
-        self, position: Tensor, rng_key: Tensor, step: Tensor, alive: Tensor | None
-    ) -> Tensor:
-        """Returns the links of the UAVs and the base, which is last, bool [envs, n + 1, n + 1].
-
-        The links between UAVs equal `radio.links` without a base.
-        """
-        given = rng_key, step
-        return radio.links_with_base(self._world.radio, position, self._base, *given, alive)
 
     def values(self, step: Tensor) -> dict[str, Tensor]:
         """Returns the measures of the episode up to a step, int64 [envs], by key, [envs] each."""

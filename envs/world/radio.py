@@ -1,7 +1,7 @@
-"""Models the radio: computes which UAVs hear each other in a step, and places for a chain."""
+"""Models the radio: which messages arrive, when, how many bytes fit, and places for a chain."""
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from emberlink.envs.config import RadioConfig, WildfireConfig
 from emberlink.envs.utils import counter_rng
@@ -14,31 +14,149 @@ _AT_PLACE = 0.01  # of the range over the ground; distance at which a relay is a
 _SILENT = 150  # steps; a UAV not heard of for so long counts as lost where UAVs fail
 
 
-def links(
-    config: RadioConfig,
-    position: Tensor,
-    rng_key: Tensor,
-    step: Tensor,
-    *,
-    alive: Tensor | None = None,
-    use: Use = Use.MESSAGE_LOSS,
-) -> Tensor:
-    """Returns the links of a step, bool [..., n, n]: row i marks the radios that radio i hears.
+_HALF, _WIDTH = 0.75, 0.08  # of the range: where `fade` loses half of the messages, and how fast
 
-    The lost messages are a function of the episode's random key and the step.
+
+class Channel(nn.Module):
+    """Decides for each pair of radios whether the message of a step is lost.
+
+    The radios are the UAVs and, last, the base if there is one. A message is lost independently
+    with probability `loss`, or in bad spells (Gilbert 1960, Elliott 1963), and with `fade` the more
+    often, the farther it goes. Random numbers are functions of the episode's key, the step and the
+    pair; between UAVs, they do not depend on the base. So methods are paired, and the links of a
+    step may be asked for several times.
 
     Args:
-        position, alive: see `in_range`.
-        rng_key: int64 [...], `keys.RNG_KEY`.
-        step: int64 [...], steps since the episode began.
+        world: the environment's constants.
+        envs: number of environments.
+        base: whether the base is a radio, too.
     """
-    linked = in_range(config, position, alive)
-    if config.loss:
-        radios = linked.shape[-1]
-        key = counter_rng.step_key(rng_key, step, use)
-        unit = counter_rng.uniform(key, radios * radios).unflatten(-1, (radios, radios))
-        linked &= unit >= config.loss
-    return linked
+
+    bad: Tensor
+    """bool [envs, radios, radios]: whether the link from a radio (column) is in a bad spell"""
+    base: Tensor
+
+    def __init__(self, world: WildfireConfig, envs: int, *, base: bool = False):
+        super().__init__()
+        self.config, radios = world.radio, world.num_uavs + base
+        place = [[*world.base, 0.0]] if base and world.base is not None else []
+        at = torch.tensor(place, dtype=torch.float64).view(-1, 3)
+        self.register_buffer("base", at, persistent=False)
+        self.register_buffer("bad", torch.zeros(envs, radios, radios, dtype=torch.bool))
+
+    def forward(
+        self, position: Tensor, rng_key: Tensor, step: Tensor, alive: Tensor | None = None
+    ) -> Tensor:
+        """Returns the links of a step, bool [..., r, r]: row i marks the radios that radio i hears.
+
+        What is sent over a link arrives `delay` steps later.
+
+        Args:
+            position: float [..., n, 3], of the UAVs, cells.
+            rng_key: int64 [...], `keys.RNG_KEY`.
+            step: int64 [...], steps since the episode began; [steps, envs] are successive steps.
+            alive: bool [..., n]; see `in_range`. The base never fails.
+        """
+        config, places = self.config, self.places(position)
+        linked = self.in_range(position, alive)
+        if config.loss:
+            unit = self._draw(rng_key, step, Use.MESSAGE_LOSS, Use.REPORT_LOSS)
+            linked &= ~(self._spells(unit, step) if config.burst > 1 else unit < config.loss)
+        if config.fade:
+            far = pairwise_distance(places) / config.range
+            unit = self._draw(rng_key, step, Use.MESSAGE_FADE, Use.REPORT_FADE)
+            linked &= unit >= fade(far)
+        return linked
+
+    def places(self, position: Tensor) -> Tensor:
+        """Returns the places of all radios, float [..., r, 3]."""
+        base = self.base.to(position.dtype).expand(*position.shape[:-2], -1, -1)
+        return torch.cat((position, base), -2)
+
+    def in_range(self, position: Tensor, alive: Tensor | None = None) -> Tensor:
+        """Returns the links of a step if no message is lost, bool [..., r, r]."""
+        if alive is not None:
+            alive = nn.functional.pad(alive, (0, len(self.base)), value=True)
+        return in_range(self.config, self.places(position), alive)
+
+    def _draw(self, rng_key: Tensor, step: Tensor, use: Use, with_base: Use) -> Tensor:
+        """Returns a number from 0 to 1 for each pair, float32 [..., r, r]."""
+        radios = self.bad.shape[-1]
+        uavs = radios - len(self.base)
+
+        def drawn(purpose: Use, side: int) -> Tensor:
+            key = counter_rng.step_key(rng_key, step, purpose)
+            return counter_rng.uniform(key, side * side).unflatten(-1, (side, side))
+
+        pairs = drawn(use, uavs)
+        if uavs == radios:
+            return pairs
+        unit = drawn(with_base, radios)
+        unit[..., :uavs, :uavs] = pairs
+        return unit
+
+    def _spells(self, unit: Tensor, step: Tensor) -> Tensor:
+        """Returns which links are in a bad spell, bool like `unit`; see `RadioConfig.burst`.
+
+        The same number moves both states of a link: below `begins` it gets bad, above `lasts` good.
+        """
+        loss = self.config.loss
+        ends = min(1 / self.config.burst, 1 - loss)
+        begins, lasts = loss * ends / (1 - loss) if loss < 1 else 1.0, 1 - ends
+        units, steps = (unit, step) if step.ndim > 1 else (unit.unsqueeze(0), step.unsqueeze(0))
+        spells = []
+        for u, first in zip(units, (steps == 0)[..., None, None], strict=True):
+            bad = (u < begins) | self.bad & (u < lasts)
+            self.bad.copy_(torch.where(first, u < loss, bad))
+            spells.append(self.bad.clone())
+        return torch.stack(spells) if step.ndim > 1 else spells[0]
+
+
+class Late(nn.Module):
+    """Keeps what was sent at the last steps, `delay` and the present one, until it arrives.
+
+    Args:
+        delay: steps from sending to receiving.
+        envs: number of environments.
+        blank: what arrives before step `delay`; of the data type of what is sent.
+        shape: of what an environment sends at a step.
+    """
+
+    sent: Tensor
+    """[envs, delay + 1, *shape]"""
+
+    def __init__(self, delay: int, envs: int, blank: Tensor, *shape: int):
+        super().__init__()
+        self.delay, self.blank = delay, blank.item()
+        size = (envs, delay + 1 if delay else 0, *shape)
+        self.register_buffer("sent", torch.full(size, self.blank, dtype=blank.dtype))
+
+    def forward(self, step: Tensor, now: Tensor) -> Tensor:
+        """Sends a tensor [envs, ...] at the steps [envs]; returns what arrives."""
+        if not self.delay:
+            return now
+        env = torch.arange(len(step), device=step.device)
+        self.sent[env, step % (self.delay + 1)] = now
+        then = self.sent[env, (step - self.delay) % (self.delay + 1)]
+        early = (step < self.delay).view(-1, *[1] * (then.ndim - 1))
+        return then.masked_fill(early, self.blank)
+
+
+def fade(far: Tensor) -> Tensor:
+    """Returns the probability that `env.radio.fade` loses a message; `far` is in ranges."""
+    return torch.sigmoid((far - _HALF) / _WIDTH)
+
+
+def budget(config: RadioConfig, near: Tensor) -> Tensor | None:
+    """Returns the bytes that each radio can say in a step, int64 [..., r]; None for no limit.
+
+    Args:
+        near: bool [..., r, r], the links if no message is lost.
+    """
+    if config.bandwidth is None:
+        return None
+    sharing = 1 + near.sum(-1) if config.shared else near.new_ones(near.shape[:-1]).long()
+    return config.bandwidth // sharing
 
 
 def in_range(config: RadioConfig, position: Tensor, alive: Tensor | None = None) -> Tensor:
@@ -52,29 +170,6 @@ def in_range(config: RadioConfig, position: Tensor, alive: Tensor | None = None)
     if alive is not None:
         linked &= alive.unsqueeze(-1) & alive.unsqueeze(-2)
     return linked
-
-
-def links_with_base(
-    config: RadioConfig,
-    position: Tensor,
-    base: Tensor,
-    rng_key: Tensor,
-    step: Tensor,
-    alive: Tensor | None = None,
-) -> Tensor:
-    """Returns the links of the UAVs and the base, which is last, bool [envs, n + 1, n + 1].
-
-    The links between UAVs equal `links` without a base.
-
-    Args:
-        config, position, rng_key, step, alive: see `links`.
-        base: float [envs, 1, 3], cells; the base never fails.
-    """
-    places = torch.cat((position, base), 1)
-    lives = None if alive is None else torch.nn.functional.pad(alive, (0, 1), value=True)
-    every = links(config, places, rng_key, step, alive=lives, use=Use.REPORT_LOSS)
-    every[:, :-1, :-1] = links(config, position, rng_key, step, alive=alive)
-    return every
 
 
 def reachable(hears: Tensor) -> Tensor:

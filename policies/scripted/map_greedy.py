@@ -21,7 +21,7 @@ from emberlink.policies.scripted.planning import (
     next_report,
     plan_period,
 )
-from emberlink.policies.scripted.team_maps import Messages, TeamMaps
+from emberlink.policies.scripted.team_maps import TARGET_BYTES, Messages, TeamMaps
 
 _FLOWN = 2.0  # cells flown between two plans
 _NEAR = 2  # cells; within this distance of known fire a cell may have ignited
@@ -82,8 +82,10 @@ class MapGreedy(Scripted):
         self.register_buffer("_area", area)
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns the bytes of a map (a step per cell) and of a target (two float32) per UAV."""
-        size = step_type(self.world.horizon).itemsize * math.prod(self.world.grid) + 8
+        """Returns the bytes of a map (a step per cell) and a target, or of the parts said."""
+        if self.maps.sent is not None:
+            return self.maps.sent[:, : self.world.num_uavs] * tensordict.get(keys.ALIVE)
+        size = step_type(self.world.horizon).itemsize * math.prod(self.world.grid) + TARGET_BYTES
         return size * tensordict.get(keys.ALIVE).long() * self.maps.sends
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -8,11 +8,14 @@ from torch import Tensor, nn
 
 from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.envs.world import radio
 from emberlink.envs.world.coverage_map import View
+from emberlink.envs.world.exchange import Exchange, cell_bytes, share, step_bytes
 from emberlink.envs.world.knowledge import Knowledge
+from emberlink.envs.world.radio import Channel
 from emberlink.envs.world.sensor import Sensor
 
+TARGET_BYTES = 8
+"""two float32 numbers"""
 Messages = Literal["none", "in range", "everyone"]
 
 
@@ -29,33 +32,41 @@ class TeamMaps(nn.Module):
     """
 
     reach: Tensor
-    """bool [envs, radios, radios]: whose messages arrive at each radio at this step"""
-    heard: Tensor
-    """float32 [envs, n, n]: step of the latest news that each UAV (row) has of another one"""
+    """bool [envs, radios, radios]: whose targets each radio knows at this step"""
+    sent: Tensor | None = None
+    """int64 [envs, radios]: bytes said at this step; None if whole maps are"""
     _start: Tensor
-    _base: Tensor
+    _own: Tensor
 
     def __init__(self, env: WildfireEnv, messages: Messages):
         super().__init__()
         self._env, self._world, self._messages = (env,), env.config, messages
         world, envs = env.config, env.num_envs
         self._sensor = Sensor.of(world)
-        listens = world.base is not None and messages == "in range"
+        listens, settings = world.base is not None and messages == "in range", world.radio
+        packets = messages == "in range" and settings.packets
+        area = self._sensor.area + world.num_uavs
         self.known = Knowledge(
             envs=envs,
             uavs=world.num_uavs,
-            area=self._sensor.area,
+            area=area,
             horizon=world.horizon,
             listeners=int(listens),
+            fires=packets,
         )
+        self.channel, self.exchange = Channel(world, envs, base=listens), None
         radios = world.num_uavs + listens
+        if packets:
+            sizes = torch.full((area,), cell_bytes(world.horizon))
+            sizes[self._sensor.area :] = 2 + step_bytes(world.horizon)  # of a UAV, and the step
+            # A target is said at once, or not at all: late, all have chosen already.
+            header = 2 + TARGET_BYTES * (settings.delay == 0)
+            self.exchange = Exchange(settings, sizes, (envs, radios), header=header)
         self.register_buffer("reach", torch.zeros(envs, radios, radios, dtype=torch.bool))
-        self.register_buffer("heard", torch.zeros(envs, world.num_uavs, world.num_uavs))
-        first = torch.arange(envs).unsqueeze(-1) * self._sensor.area
+        first = torch.arange(envs).unsqueeze(-1) * area
         self.register_buffer("_start", first, persistent=False)
-        base = torch.tensor([[*(world.base or (0.0, 0.0)), 0.0]], dtype=torch.float64)
-        base = base.repeat(envs if listens else 0, 1, 1)
-        self.register_buffer("_base", base, persistent=False)
+        own = self._sensor.area + torch.arange(world.num_uavs) + first
+        self.register_buffer("_own", own.unsqueeze(-1), persistent=False)
 
     @property
     def sends(self) -> bool | Tensor:
@@ -68,25 +79,30 @@ class TeamMaps(nn.Module):
         step = tensordict.get(keys.STEP)
         begins = step == 0
         self.known.start_episodes(begins)
+        if self.exchange is not None:
+            self.exchange.start_episodes(begins)
         position = tensordict.get(keys.POSITION).double()
         alive = tensordict.get(keys.ALIVE)
         given = tensordict.get(keys.RNG_KEY), step
         _, cells, in_view = self._sensor.look(position, self._start, *given)
+        # A UAV sees itself, too: an entry behind the cells.
+        cells = torch.cat((cells, self._own), -1)
+        in_view = torch.nn.functional.pad(in_view, (0, 1), value=True)
         in_view &= (alive & ~begins.unsqueeze(-1)).unsqueeze(-1)
         hears = self._hears(tensordict, position, alive)
-        self.known.update(View(cells, in_view, in_view), step, hears)
-        self.reach.copy_(radio.reachable(hears))
-        self._update_heard(step, alive)
+        near = self.channel.in_range(position, alive)
+        self.sent = share(
+            self.known, self.exchange, View(cells, in_view, in_view), step, near, hears
+        )
+        self.reach.copy_(self.known.reach)
+        if self._world.radio.delay and self.exchange is not None:
+            self.reach.zero_()
 
-    def _update_heard(self, step: Tensor, alive: Tensor) -> None:
-        """Stores the steps of the latest news, direct or passed on."""
-        now, uavs = step.view(-1, 1, 1).float(), self._world.num_uavs
-        reach = self.reach[:, :uavs, :uavs]
-        self.heard.masked_fill_(now == 0, 0.0)
-        own = torch.eye(uavs, dtype=torch.bool, device=alive.device) & alive.unsqueeze(-1)
-        known = torch.where(own, now, self.heard)
-        told = torch.where(reach.unsqueeze(-1), known.unsqueeze(1), 0.0).amax(2)
-        self.heard.copy_(torch.maximum(self.heard, told))
+    @property
+    def heard(self) -> Tensor:
+        """The step of the latest news that each UAV (row) has of another one, [envs, n, n]."""
+        uavs = self._world.num_uavs
+        return self.known.last_seen[:, :uavs, -uavs:].clamp(min=0)
 
     def _hears(self, tensordict: TensorDictBase, position: Tensor, alive: Tensor) -> Tensor:
         """Returns the links of a step, bool [envs, radios, radios]."""
@@ -95,15 +111,12 @@ class TeamMaps(nn.Module):
         if self._messages == "everyone":
             return alive.unsqueeze(-1) & alive.unsqueeze(-2)
         given = tensordict.get(keys.RNG_KEY), tensordict.get(keys.STEP)
-        config = self._world.radio
-        if len(self._base):
-            return radio.links_with_base(config, position, self._base, *given, alive)
-        return radio.links(config, position, *given, alive=alive)
+        return self.channel(position, *given, alive)
 
     def last_seen(self) -> Tensor:
         """Returns the last step at which each UAV knows each cell seen, float [envs, n, X, Y]."""
-        seen = self._sensor.crop(self.known.last_seen[:, : self._world.num_uavs])
-        return seen.float()
+        seen = self.known.last_seen[:, : self._world.num_uavs, : self._sensor.area]
+        return self._sensor.crop(seen).float()
 
     def was_fire(self, last_seen: Tensor) -> tuple[Tensor, Tensor]:
         """Returns whether cells had ignited and burnt out at `last_seen`, bool like `last_seen`."""

@@ -87,11 +87,5 @@ def test_a_uav_observes_its_own_vector_first(reach):
 
 @pytest.mark.filterwarnings("error::UserWarning")
 @pytest.mark.parametrize("method", EVERY)
-def test_a_bandwidth_that_a_method_does_not_heed_causes_a_warning(method):
-    limited = {"env.radio.bandwidth": 20}
-    if method in ("positional", "consensus"):
-        message = rf"bandwidth=20: the messages of comm\.name={method} are not limited"
-        with pytest.warns(UserWarning, match=message):
-            recipe(method, **limited)
-    else:
-        recipe(method, **limited)
+def test_every_method_heeds_delay_and_bandwidth(method):
+    recipe(method, **{"env.radio.bandwidth": 20, "env.radio.delay": 2})

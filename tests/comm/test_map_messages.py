@@ -4,16 +4,9 @@ import pytest
 import torch
 from scalar_maps import Teller
 
-from emberlink.comm._messages import (
-    CellMessages,
-    cell_bytes,
-    offers,
-    pass_on_places,
-    place_bytes,
-    place_gain,
-    said_within,
-)
+from emberlink.envs.config import RadioConfig
 from emberlink.envs.world.coverage_map import View
+from emberlink.envs.world.exchange import Exchange, cell_bytes
 from emberlink.envs.world.knowledge import Knowledge
 
 ENVS, UAVS, AREA, STEPS = 3, 5, 40, 25
@@ -42,71 +35,51 @@ def links(step: int, density: float, loss: float) -> tuple[torch.Tensor, torch.T
     return near, near & (draw(step + 900, ENVS, UAVS, UAVS) >= loss) if loss else near
 
 
-@pytest.mark.parametrize(
-    ("horizon", "cell", "position"), [(1000, 5, 16), (65_535, 5, 16), (65_536, 7, 18)]
-)
-def test_steps_above_65535_take_four_bytes(horizon, cell, position):
-    assert (cell_bytes(horizon), place_bytes(horizon)) == (cell, position)
+@pytest.mark.parametrize(("horizon", "cell"), [(1000, 5), (65_535, 5), (65_536, 7)])
+def test_steps_above_65535_take_four_bytes(horizon, cell):
+    assert cell_bytes(horizon) == cell
 
 
-def talk(messages, known, places, links, limit) -> list:
-    """Lets all UAVs talk, and returns the bytes of cells and of positions, [envs, n] each."""
-    near, hears = links
-    stamp, place = places
-    news, cells, chosen = messages.compare(known, near), None, None
-    if limit is not None:
-        offered = offers(known, news, limit // CELL_BYTES), place_gain(stamp, near)
-        area = known.last_seen.shape[-1]
-        cells, chosen = said_within(limit, *offered, area, (CELL_BYTES, PLACE_BYTES))
-    return [
-        messages.pass_on(known, near, hears, news, cells),
-        pass_on_places(stamp, place, near, hears, chosen, PLACE_BYTES),
-    ]
-
-
-@pytest.mark.parametrize("limit", [None, 4, 5, 16, 23, 60])
 @pytest.mark.parametrize(("density", "loss"), [(0.3, 0.0), (0.8, 0.4)])
-def test_exchange_matches_reference(limit, density, loss):
-    known = Knowledge(envs=ENVS, uavs=UAVS, area=AREA, horizon=4 * STEPS + 3, fires=True)
-    messages = CellMessages(ENVS, UAVS, AREA, CELL_BYTES)
-    stamp, place = torch.full((ENVS, UAVS, UAVS), -1), torch.zeros(ENVS, UAVS, UAVS, 3)
-    own = torch.arange(UAVS)
-    tellers = [Teller(UAVS) for _ in range(ENVS)]
-    said_any = torch.zeros(2)
+def test_exchange_matches_reference(density, loss):
+    items = AREA + UAVS
+    known = Knowledge(envs=ENVS, uavs=UAVS, area=items, horizon=4 * STEPS + 3, fires=True)
+    sizes = torch.tensor([CELL_BYTES] * AREA + [PLACE_BYTES] * UAVS)
+    messages = Exchange(RadioConfig(), sizes, (ENVS, UAVS), unit=4, free=True)
+    own = AREA + torch.arange(UAVS).view(-1, 1) + items * torch.arange(ENVS).view(-1, 1, 1)
+    tellers, said = [Teller(UAVS) for _ in range(ENVS)], 0
     for step in range(1, STEPS):
         view, code = looks(step)
-        known.see(view, 4 * step + code)
+        cells = torch.cat((view.cells + (items - AREA) * torch.arange(ENVS).view(-1, 1, 1), own), 2)
+        flags = [torch.nn.functional.pad(view.in_view, (0, 1), value=True), view.burning]
+        view = View(cells, flags[0], torch.nn.functional.pad(flags[1], (0, 1)))
+        known.see(view, 4 * step + torch.nn.functional.pad(code, (0, 1)))
         messages.saw(view)
-        stamp[:, own, own], place[:, own, own] = step, 10.0 * step + own[:, None].float()
         linked = links(step, density, loss)
-        sent = talk(messages, known, (stamp, place), linked, limit)
+        sent, _, _ = messages(known, *linked, torch.full((ENVS,), step), None)
         for env, teller in enumerate(tellers):
             for uav in range(UAVS):
-                seen = view.in_view[env, uav]
-                cells = (view.cells[env, uav][seen] - env * AREA).tolist()
+                seen = view.in_view[env, uav, :-1]
+                cells = (view.cells[env, uav, :-1][seen] - env * items).tolist()
                 codes = code[env, uav][seen].tolist()
                 teller.see(uav, dict(zip(cells, codes, strict=True)), step)
-            counts = teller.talk(*(x[env].tolist() for x in linked), limit, area=AREA)
-            expected = torch.tensor(counts).T * torch.tensor([[CELL_BYTES], [PLACE_BYTES]])
-            assert torch.stack([x[env] for x in sent]).equal(expected), (step, env)
-            said_any += expected.sum(1)
-            check_knowledge(teller, known, stamp, place, env)
-    bytes_left = 10**9 if limit is None else limit
-    assert (said_any > 0).tolist() == [bytes_left >= CELL_BYTES, bytes_left >= PLACE_BYTES]
+            counts = teller.talk(*(x[env].tolist() for x in linked))
+            assert sent[env].tolist() == [CELL_BYTES * c + PLACE_BYTES * p for c, p in counts]
+            said += sum(map(sum, counts))
+            check_knowledge(teller, known, env)
+    assert said > 100
 
 
-def check_knowledge(teller, known, stamp, place, env) -> None:
+def check_knowledge(teller, known, env) -> None:
     """Checks that the UAVs of an environment have the teller's maps."""
     for uav in range(UAVS):
         last = {
             cell: (number // 4, number % 4)
-            for cell, number in enumerate(known.last_seen[env, uav].tolist())
+            for cell, number in enumerate(known.last_seen[env, uav, :AREA].tolist())
             if number >= 0
         }
         assert last == teller.looks[uav]
         assert set(known.seen_fire[env, uav].nonzero().flatten().tolist()) == teller.fires[uav]
         for other in range(UAVS):
             step = teller.places[uav].get(other, -1)
-            assert stamp[env, uav, other] == step
-            if step >= 0:
-                assert (place[env, uav, other] == 10.0 * step + other).all()
+            assert known.last_seen[env, uav, AREA + other] >> 2 == step

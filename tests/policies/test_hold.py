@@ -63,11 +63,14 @@ def test_environments_decide_at_their_own_steps():
 
 LOST = ["env.failures=2.0", "env.radio.loss=0.3", "env.measures=all", "fire.burn_time=15.0"]
 BASED = ["world=blackout", "env.horizon=60", "env.grid=[24, 24]", "env.base=[3.0, 12.0]"]
+BURSTS = ["env.radio.burst=5.0", "env.radio.fade=true", "env.radio.shared=true"]
 METHODS = ["independent", "positional", "consensus", "maps"]
 WORLDS = {
     "plain": (2, []),
     "lost messages, failures, burning out": (10, LOST),
     "base, limited radio": (4, [*BASED, "env.radio.bandwidth=90", "env.radio.range=15.0"]),
+    "late, bursty, limited": (5, [*BASED, "env.radio.delay=7", "env.radio.bandwidth=90", *BURSTS]),
+    "late": (5, ["env.measures=all", "env.radio.delay=2"]),
     "window": (10, ["env.observation=window", "env.observation_scale=raw", *LOST]),
     "map": (10, ["env.observation=map", *LOST]),
 }
@@ -85,13 +88,14 @@ def make_pair(method: str, hold: int, options: list[str]):
     return envs
 
 
-@pytest.mark.filterwarnings("ignore:env.radio.bandwidth")
 @pytest.mark.parametrize(
     ("method", "world"),
     [
         *((method, "lost messages, failures, burning out") for method in METHODS),
         *(("independent", "plain"), ("positional", "window"), ("consensus", "map")),
         *((method, "base, limited radio") for method in ("consensus", "maps")),
+        *((method, "late, bursty, limited") for method in ("consensus", "maps")),
+        ("positional", "late"),
     ],
 )
 def test_a_held_action_equals_its_steps_one_by_one(method, world):

@@ -21,8 +21,8 @@ _SAME = {"map_greedy": ("map_greedy_alone", "map_greedy_all")}
 without a base"""
 _OF_LEARNERS = ("env.reward.", "env.observation", "env.measures")
 """beginnings of the keys of `env` that do not change what scripted policies do"""
-_OFF, _FULL = (0.0, None, None), (float("inf"), None, None)
-"""range, loss and bandwidth of a radio; None for no loss or no limit, and where it has no effect"""
+_OFF, _FULL = ((reach, *[None] * (len(RADIO) - 1)) for reach in (0.0, float("inf")))
+"""values of `RADIO`; None where it has no effect"""
 COLUMNS = (
     *("section", "fires", "label", "measure", "radios", "none", "with_radio", "full"),
     *("gain", "gain_low", "gain_high", "value", "value_low", "value_high"),
@@ -76,10 +76,10 @@ def _of_networks(groups: Mapping[str, Group], fires: str) -> Found:
 def _of_scripted(groups: Mapping[str, Group], fires: str) -> Found:
     """Yields scripted policies; without a base no evaluation with another radio is needed."""
     trained = [group[0] for group in groups.values() if not group[0].evaluated_with]
-    limited = {heeded(run): run for run in trained[::-1] if heeded(run) not in (_OFF, _FULL)}
+    limited = {_radio(run): run for run in trained[::-1] if _radio(run) not in (_OFF, _FULL)}
     for policy, world in product(SCRIPTED, limited.values()):
         alike = [run for runs in groups.values() for run in runs if _world(run) == _world(world)]
-        none, full = (next((r for r in alike if heeded(r) == x), None) for x in (_OFF, _FULL))
+        none, full = (next((r for r in alike if _radio(r) == x), None) for x in (_OFF, _FULL))
         choices = [(none, policy), (world, policy), (full, policy)]
         if world.settings.get("env.base") is None and policy in _SAME:
             off, unlimited = _SAME[policy]
@@ -87,20 +87,18 @@ def _of_scripted(groups: Mapping[str, Group], fires: str) -> Found:
         played = [run and run.evaluation.results[fires].get(name) for run, name in choices]
         measured = [np.array([p[world.headline]]) for p in played if p and world.headline in p]
         if len(measured) == len(choices):
-            several = f", {radio_text(world.now, bandwidth=False)}" if len(limited) > 1 else ""
+            several = f", {radio_text(world.now)}" if len(limited) > 1 else ""
             yield policy.replace("_", " ") + several, world.headline, "scripted", measured
 
 
-def _radio(run: Run) -> tuple[float, Any, Any]:
-    """Returns range, loss and bandwidth of the radio of a run's evaluation."""
-    reach, loss, bandwidth = (run.now.get(key) for key in RADIO)
+def _radio(run: Run) -> tuple[Any, ...]:
+    """Returns the radio of a run's evaluation, as `_OFF`."""
+    reach, loss, bandwidth, burst, *more = (run.now.get(key) for key in RADIO)
     reach = float("inf") if reach is None else float(reach)
-    return _OFF if reach == 0 else (reach, loss or None, bandwidth)
-
-
-def heeded(run: Run) -> tuple[float, Any, Any]:
-    """Returns the radio of an evaluation without the bandwidth, for scripted policies."""
-    return (*_radio(run)[:2], None)
+    burst = burst if loss and burst != 1 else None
+    return (
+        _OFF if reach == 0 else (reach, loss or None, bandwidth, burst, *(x or None for x in more))
+    )
 
 
 def _evaluated(group: Group, other: Group) -> bool:

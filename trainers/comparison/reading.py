@@ -26,11 +26,12 @@ from emberlink.trainers.runs.run_folder import MAX_JSON, RunFolder, read_text
 LeftOut = tuple[str, str]
 """a folder or file that is not compared, and the reason"""
 Settings = Annotated[dict[str, Any], AfterValidator(infinite)]
-RADIO = "env.radio.range", "env.radio.loss", "env.radio.bandwidth"
+_RADIO = "range", "loss", "bandwidth", "burst", "delay", "fade", "shared"
+RADIO = tuple(f"env.radio.{key}" for key in _RADIO)
 _TYPES: dict[str, Any] = {
     **dict.fromkeys(("method", "setup", "world", "fire.name"), str),
     **dict.fromkeys(("seed", "edition", "episodes", "num_envs", "env.horizon"), int),
-    **dict.fromkeys(RADIO, int | float | None),
+    **dict.fromkeys(RADIO, bool | int | float | None),
     "evaluation.headline": str | None,
 }
 """keys that are read here -> their type, with None if they may be missing"""

@@ -100,6 +100,13 @@ class RunConfig(Basics):
             raise UserError(f"evaluation.headline={headline} {where}; known: {', '.join(known)}")
         return self
 
+    @model_validator(mode="after")
+    def _check_delay(self) -> "RunConfig":
+        delay, message = self.env.radio.delay, self.policy.message
+        if delay and message != "none":
+            raise UserError(f"env.radio.delay={delay}: policy.message={message} cannot be late")
+        return self
+
     @field_validator("policy")
     @classmethod
     def _check_memory(cls, value: PolicyConfig) -> PolicyConfig:
@@ -125,11 +132,11 @@ class RunConfig(Basics):
 
 
 def build_comm(config: RunConfig, num_envs: int) -> CommModule:
-    """Returns a new communication module; warns if it does not heed a limit of bytes."""
-    kind, limit = MODULES.find(config.comm["name"]), config.env.radio.bandwidth
-    if limit is not None and kind.hears and not kind.heeds_bandwidth:
+    """Returns a new communication module; warns if it does not heed delay and bandwidth."""
+    kind, radio = MODULES.find(config.comm["name"]), config.env.radio
+    if radio.packets and kind.hears and not kind.heeds_packets:
         name = config.comm["name"]
-        said = f"env.radio.bandwidth={limit}: the messages of comm.name={name} are not limited"
+        said = f"env.radio.delay or bandwidth: the messages of comm.name={name} heed neither"
         warnings.warn(said, stacklevel=2)
     module = kind(config.env, _settings("comm", config.comm, MODULES), num_envs)
     module.hold = config.policy.hold

@@ -13,9 +13,9 @@ from torch import Tensor
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.envs.world import radio
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.measures import Measures, whole_steps
+from emberlink.envs.world.radio import Channel
 from emberlink.envs.world.sensor import Sensor
 
 COUNTS = {"seen": keys.SEEN, "burning": keys.BURNING, "burnt": keys.BURNT}
@@ -147,8 +147,7 @@ class Recorder:
         ]
         counts = self._burning(torch.zeros(1)).sum(-1), (self._whole[0] == 0).sum(-1)
         self._measures.start_episodes(torch.ones(1, dtype=torch.bool), arrival, *counts)
-        base = world.config.base
-        self._base = torch.zeros(1, 0, 3) if base is None else torch.tensor([[[*base, 0.0]]])
+        self._channel = Channel(world.config, 1, base=world.config.base is not None)
 
     def _look(self, now: TensorDictBase) -> dict[str, Tensor]:
         """Returns the views, links and ages of a time step of batch size [1]."""
@@ -165,14 +164,8 @@ class Recorder:
             self._measures.update(seen, (row, cell), self._times, *at)
         else:
             whole.zero_()
-        if self._config.base is None:
-            hears = radio.links(self._config.radio, position, key, step, alive=alive)
-        else:
-            hears = self._measures.hears(position, key, step, alive)
-        lives = torch.nn.functional.pad(alive, (0, self._base.shape[1]), value=True)
-        places = torch.cat((position, self._base.double()), 1)
-        near = radio.neighbours(places, self._config.radio.range)
-        near &= lives.unsqueeze(-1) & lives.unsqueeze(-2)
+        hears = self._channel(position, key, step, alive)
+        near = self._channel.in_range(position, alive)
         measured = self._measures.values(step)
         ages = {name: measured[key] for name, key in (AGES | OF_BASE).items() if key in measured}
         bounds = self._bounds(view._replace(in_view=whole))

@@ -84,8 +84,8 @@ def test_a_value_is_undetermined_where_no_limits_may_gain_nothing(tmp_path):
 
 
 def test_scripted_policies_have_a_value_for_each_radio(tmp_path):
-    more = "env.radio.bandwidth=8"  # which scripted policies ignore
-    for reach, middle, other in ((20, 58.0, ()), (5, 52.0, ()), (5, 52.0, (more,))):
+    more = "env.radio.bandwidth=8", "env.radio.delay=5"
+    for reach, middle, other in ((20, 58.0, ()), (5, 52.0, ()), (5, 51.0, more)):
         overrides = (f"env.radio.range={reach}", *other)
         write_run(
             tmp_path,
@@ -94,7 +94,8 @@ def test_scripted_policies_have_a_value_for_each_radio(tmp_path):
             overrides=overrides,
         )
     found = {row["label"]: row["value"] for row in values(tmp_path)}
-    assert found == {"map greedy, range 20": 0.8, "map greedy, range 5": 0.2}
+    few = {"map greedy, range 5, delay 5, 8 bytes": 0.1}
+    assert found == {"map greedy, range 20": 0.8, "map greedy, range 5": 0.2} | few
 
 
 def covering(**coverage: float):

@@ -140,6 +140,16 @@ def test_messages_maps_and_the_sensor_are_resumed(method, more, whole, tmp_path)
     assert_same(whole(method, *more), stopped_at([6, 20, 34], method, tmp_path, *more))
 
 
+LATE = ["env.radio.delay=5", "env.radio.bandwidth=200", "env.radio.loss=0.3", "env.radio.burst=4.0"]
+
+
+@pytest.mark.parametrize("method", ["consensus", "maps"])
+def test_messages_in_flight_are_resumed(method, whole, tmp_path):
+    more = [*REPLAY, *LATE, "env.base=[3, 3]", "env.measures=all", "env.radio.range=60"]
+    more += ["env.map.pixels=8"] if method == "maps" else []
+    assert_same(whole(method, *more), stopped_at([7, 33, 61], method, tmp_path, *more))
+
+
 def test_held_actions_failures_and_evaluations_are_resumed(whole, tmp_path):
     more = *REPLAY, "policy.hold=2", "env.failures=1", "evaluation.interval=2", "checkpoint_steps=7"
     assert_same(whole("consensus", *more), stopped_at([10, 46, 60], "consensus", tmp_path, *more))

@@ -1,0 +1,313 @@
+"""Passes on what radios know, one link a step, within a limit of bytes and with a delay."""
+
+import torch
+from torch import Tensor, nn
+
+from emberlink.envs.config import RadioConfig
+from emberlink.envs.world.coverage_map import View, mark, own_maps
+from emberlink.envs.world.knowledge import Knowledge
+from emberlink.envs.world.radio import Late, budget
+
+OLD = 100
+"""largest gain of an entry for one hearer, steps"""
+CONTACT = 10
+"""steps after its last message for which a radio counts as in range"""
+ACKNOWLEDGEMENT = 2
+"""bytes of the number of a radio whose message was received"""
+_NOTHING = -2
+"""the code of an entry that nobody has seen"""
+
+
+class Exchange(nn.Module):
+    """Lets radios say the entries of their maps that others lack.
+
+    A radio says an entry if a radio in range has no look at it, has an older one, or does not know
+    that it was seen while it burned. What it receives, it passes on from the next step on.
+
+    A radio knows of others what it hears: who was in range lately, what a radio has said, and which
+    messages it has acknowledged. An acknowledgement is part of the next message, so that an entry
+    is said again `2 delay + 2` steps later if none has come. With `free`, radios know who is in
+    range and what they have, at no cost; nothing is late or limited.
+
+    Within a limit of bytes, the entries of the highest gain are said: the steps by which the looks
+    of the radios in range get newer, at most `OLD` each.
+
+    An entry is coded as twice its number in the map, plus whether it was seen while it burned.
+
+    Args:
+        config: the radio.
+        sizes: int64 [items], the bytes of each entry of a map.
+        shape: environments and radios.
+        unit: numbers in a map per step.
+        header: bytes that a radio says in each step, 2 of them its number.
+        free: see above.
+    """
+
+    pending: Tensor
+    """bool [envs, r, items]: entries that a radio in range may lack"""
+    contact: Tensor
+    """bool [envs, r, r]: the radios (column) that were in range of a radio at the last step"""
+    has: Tensor
+    """int32 [envs, r, items, r]: codes that a radio (second) knows another one (last) to have"""
+    told: Tensor
+    """int32 [envs, r, items]: codes last said"""
+    told_at: Tensor
+    """int64 [envs, r, items]: the steps at which they were said, -1 for never"""
+    heard: Tensor
+    """int64 [envs, r, r]: step of the last message that a radio (row) received, -1 for none"""
+    got: Tensor
+    """bool [envs, r, r]: the messages that a radio (row) received at the last step"""
+    acknowledged: Tensor
+    """bool [envs, r, r]: the messages of a radio (row) that others acknowledged at the last step"""
+    sizes: Tensor
+    _first: Tensor
+
+    def __init__(
+        self,
+        config: RadioConfig,
+        sizes: Tensor,
+        shape: tuple[int, int],
+        *,
+        unit: int = 1,
+        header: int = 2,
+        free: bool = False,
+    ):
+        super().__init__()
+        self.config, self.unit, self.header, self.free = config, unit, header, free
+        self.wait, items = 2 * config.delay + 2, len(sizes)
+        (envs, radios), self.shape = shape, (*shape, items)
+        self.register_buffer("sizes", sizes, persistent=False)
+        self.register_buffer("_first", own_maps(*self.shape), persistent=False)
+        self.register_buffer("pending", torch.zeros(self.shape, dtype=torch.bool))
+        pairs = envs, radios, radios
+        self.register_buffer("contact", torch.zeros(pairs, dtype=torch.bool))
+        if free:
+            return
+        for name in ("got", "acknowledged"):
+            self.register_buffer(name, torch.zeros(pairs, dtype=torch.bool))
+        self.register_buffer("heard", torch.full(pairs, -1))
+        self.register_buffer("told_at", torch.full(self.shape, -1))
+        nothing = torch.tensor(_NOTHING, dtype=torch.int32)
+        self.register_buffer("told", nothing.repeat(self.shape))
+        self.register_buffer("has", nothing.repeat(*self.shape, radios))
+        self.messages = Late(config.delay, envs, nothing, radios, items)
+        no = torch.tensor(False)
+        self.links, self.acks = (Late(config.delay, envs, no, radios, radios) for _ in range(2))
+
+    def start_episodes(self, mask: Tensor) -> None:
+        """Forgets everything in the environments of a mask, bool [envs]."""
+        blank = {"pending": False, "contact": False}
+        if not self.free:
+            blank |= {"got": False, "acknowledged": False, "heard": -1}
+            blank |= {"told_at": -1, "told": _NOTHING, "has": _NOTHING}
+            self.links.sent[mask] = False
+        for name, value in blank.items():
+            getattr(self, name)[mask] = value
+
+    def saw(self, view: View) -> None:
+        """Notes the cells that UAVs see at this step."""
+        mark(self.pending, view.cells + self._first[:, : view.cells.shape[1]], view.in_view)
+
+    def forward(
+        self, known: Knowledge, near: Tensor, hears: Tensor, step: Tensor, left: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Speaks and listens for a step; updates the maps of the hearers.
+
+        Args:
+            known: the maps of all radios.
+            near, hears: bool [envs, r, r], the radios (column) in range of a radio, and those of
+                whose messages of this step none is lost.
+            step: int64 [envs], steps since the episode began.
+            left: int64 [envs, r], the bytes that each radio can say; None for no limit.
+
+        Returns:
+            The bytes that each radio says, int64 [envs, r]; the messages (column) that arrive at
+            each radio, bool [envs, r, r]; and which entries have changed by whose message, as
+            (environment, hearer, speaker, entry), int64 [4, k].
+        """
+        entry, code, spent = self._speak(known, near, step, left)
+        size = self.sizes[entry % self.shape[2]]
+        sent = spent.view(-1).index_add(0, entry // self.shape[2], size).view_as(spent)
+        if self.free:
+            return sent, hears, self._listen(known, entry, code, hears)
+        now = hears & (sent > 0).unsqueeze(1)
+        if self.config.delay:
+            said = torch.full(self.shape, _NOTHING, dtype=torch.int32, device=entry.device)
+            said.view(-1)[entry] = code
+            said = self.messages(step, said).view(-1)
+            entry = (said != _NOTHING).nonzero().squeeze(-1)
+            code = said[entry]
+        arrives = self.links(step, now)
+        self.acknowledged.copy_(arrives & self.acks(step, self.got).mT)
+        self.got.copy_(arrives)
+        self.heard.copy_(torch.where(arrives, step.view(-1, 1, 1), self.heard))
+        return sent, arrives, self._listen(known, entry, code, arrives)
+
+    def _speak(
+        self, known: Knowledge, near: Tensor, step: Tensor, left: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns the entries said and their codes, [k] each, and the bytes besides, [envs, r]."""
+        radios, items = self.shape[1:]
+        heard = None if self.free else step.view(-1, 1, 1) - self.heard
+        contact = near.mT if heard is None else (heard < CONTACT) & (self.heard >= 0)
+        met = (contact & ~self.contact).any(-1)
+        self.pending[met] = known.last_seen[met] >= 0
+        self.contact.copy_(contact)
+        entry = _marked(self.pending, contact.any(-1))
+        row = entry // items
+        mine, theirs = codes(known, entry), self._theirs(known, entry)
+        spent = torch.zeros_like(near[..., 0], dtype=torch.int64)
+        waits = recent = told = None
+        if not self.free:
+            now = step[row // radios]
+            told, at = self.told.view(-1)[entry], self.told_at.view(-1)[entry]
+            back = self.acknowledged.flatten(0, 1)[row] & (at == now - self.wait).unsqueeze(-1)
+            theirs = torch.where(back, merged(theirs, told.unsqueeze(-1)), theirs)
+            self.has.view(-1, radios)[entry] = theirs
+            recent = (at >= 0) & (now - at < self.wait)
+            waits = recent & (told == mine)
+            spent, left = self._open(left)
+        lacks = contact.flatten(0, 1)[row] & newer(mine.unsqueeze(-1), theirs)
+        says = lacks.any(-1)
+        self.pending.view(-1)[entry] = says
+        if waits is not None:
+            says = says & ~waits
+        if left is not None and recent is not None and told is not None:
+            size = self.sizes[entry % items]
+            says &= size <= left.view(-1)[row]
+            expected = torch.where(recent.unsqueeze(-1), merged(theirs, told.unsqueeze(-1)), theirs)
+            gain = (self._gain(mine.unsqueeze(-1), expected) * lacks).sum(-1)[says]
+            says[says.clone()] = self._fits(entry[says], gain, size[says], left.view(-1))
+        entry, mine = entry[says], mine[says]
+        if not self.free:
+            self.told.view(-1)[entry] = mine
+            self.told_at.view(-1)[entry] = step[entry // items // radios]
+        return entry, mine, spent
+
+    def _open(self, left: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """Returns the bytes of headers and acknowledgements, and what is left, int64 [envs, r].
+
+        Acknowledgements that do not fit are dropped.
+        """
+        if left is not None:
+            needed = self.header + ACKNOWLEDGEMENT * self.got.cumsum(-1)
+            self.got &= needed <= left.unsqueeze(-1)
+        spent = self.header + ACKNOWLEDGEMENT * self.got.sum(-1)
+        if left is None:
+            return spent, None
+        speaks = left >= self.header
+        return spent * speaks, (left - spent) * speaks
+
+    def _theirs(self, known: Knowledge, entry: Tensor) -> Tensor:
+        """Returns the codes that other radios have, as far as is known, int32 [k, r]."""
+        radios, items = self.shape[1:]
+        if not self.free:
+            return self.has.view(-1, radios)[entry]
+        first = entry // (radios * items) * radios * items + entry % items
+        return codes(known, first.unsqueeze(-1) + items * torch.arange(radios, device=entry.device))
+
+    def _gain(self, mine: Tensor, theirs: Tensor) -> Tensor:
+        """Returns the steps by which looks get newer, from step -1 where fire is news."""
+        before = torch.where((mine & ~theirs & 1) > 0, -1, (theirs >> 1) // self.unit)
+        return ((mine >> 1) // self.unit - before).clamp(0, OLD)
+
+    def _fits(self, entry: Tensor, gain: Tensor, size: Tensor, left: Tensor) -> Tensor:
+        """Returns which entries are said: those of the highest gain that fit together, bool [k].
+
+        Of equal gain, those that a radio says first depend on its number, so that radios say
+        different ones.
+        """
+        radios, items = self.shape[1:]
+        row, most = entry // items, radios * OLD
+        turned = (entry % items + row % radios * (items // radios)) % items
+        order = ((row * (most + 1) + most - gain) * items + turned).argsort()
+        total, row = size[order].cumsum(0), row[order]
+        count = row.bincount(minlength=len(left))
+        before = nn.functional.pad(total, (1, 0))[count.cumsum(0) - count]
+        fits = torch.empty_like(order, dtype=torch.bool)
+        fits[order] = total - before[row] <= left[row]
+        return fits
+
+    def _listen(self, known: Knowledge, entry: Tensor, code: Tensor, arrives: Tensor) -> Tensor:
+        """Enters what arrives into the maps; returns the changes, see `forward`."""
+        radios, items = self.shape[1:]
+        row = entry // items
+        which, hearer = arrives.mT.flatten(0, 1)[row].nonzero(as_tuple=True)
+        row, cell, code = row[which], entry[which] % items, code[which]
+        env, speaker = row // radios, row % radios
+        target = (env * radios + hearer) * items + cell
+        changed = newer(code, codes(known, target))
+        self.pending.view(-1)[target[changed]] = True
+        last, seen = known.last_seen, known.seen_fire
+        assert seen is not None
+        last.view(-1).scatter_reduce_(0, target, (code >> 1).to(last.dtype), "amax")
+        mark(seen, target, (code & 1) > 0)
+        if not self.free:
+            at = target * radios + speaker
+            self.has.view(-1)[at] = merged(self.has.view(-1)[at], code)
+        newest = changed & (code >> 1 == last.view(-1)[target])
+        return torch.stack((env, hearer, speaker, cell))[:, newest]
+
+
+def share(
+    known: Knowledge,
+    exchange: Exchange | None,
+    view: View,
+    step: Tensor,
+    near: Tensor,
+    hears: Tensor,
+) -> Tensor | None:
+    """Adds the sightings and messages of a step to maps; at once and along any path without limits.
+
+    Args:
+        view: the cells in view.
+        near, hears, step: see `Exchange`.
+
+    Returns:
+        The bytes that each radio says, int64 [envs, r]; None without an exchange.
+    """
+    if exchange is None:
+        known.update(view, step, hears)
+        return None
+    known.see(view, step.view(-1, 1, 1))
+    exchange.saw(view)
+    sent, arrives, _ = exchange(known, near, hears, step, budget(exchange.config, near))
+    known.reach.copy_(arrives).diagonal(dim1=1, dim2=2).fill_(True)
+    return sent
+
+
+def cell_bytes(horizon: int) -> int:
+    """Returns the bytes of a message about a cell: index (2), step of the last look, state (1)."""
+    return 3 + step_bytes(horizon)
+
+
+def step_bytes(horizon: int) -> int:
+    """Returns the bytes of a step in a message."""
+    return 2 if horizon < 2**16 else 4
+
+
+def codes(known: Knowledge, entry: Tensor) -> Tensor:
+    """Returns the codes of entries of the flat maps, int32."""
+    assert known.seen_fire is not None
+    return 2 * known.last_seen.view(-1)[entry].int() + known.seen_fire.view(-1)[entry]
+
+
+def newer(told: Tensor, theirs: Tensor) -> Tensor:
+    """Returns whether a code is of a newer look, or of the first one in flames."""
+    return (told >> 1 > theirs >> 1) | (told & ~theirs & 1 > 0)
+
+
+def merged(one: Tensor, other: Tensor) -> Tensor:
+    """Returns the code of the newer look, with the fire that either has seen."""
+    return torch.maximum(one, other) >> 1 << 1 | (one | other) & 1
+
+
+def _marked(pending: Tensor, rows: Tensor) -> Tensor:
+    """Returns the flat indices that are marked in rows, bool [envs, r], sorted."""
+    items, row = pending.shape[2], rows.view(-1).nonzero().squeeze(-1)
+    maps = pending.flatten(0, 1).index_select(0, row).flatten()
+    # Eight flags are read at a time, as most of them are not set.
+    eights = nn.functional.pad(maps, (0, -len(maps) % 8)).view(-1, 8)
+    some = eights.view(torch.int64).squeeze(-1).nonzero().squeeze(-1)
+    at = (8 * some.unsqueeze(-1) + torch.arange(8, device=maps.device))[eights[some]]
+    return row.take(at // items) * items + at % items
