@@ -303,8 +303,8 @@ class Communication(Transform):
             total = total + of_steps(steps, keys.REPORT_BYTES)
         if self.message_bytes and world.radio.range:
             says = alive & (of_steps(steps, keys.STEP) % self.module.hold == 0).unsqueeze(-1)
-            if world.radio.bandwidth is not None:
-                says &= torch.stack([self.module.budget(step) >= 0 for step in steps])
+            left = [self.module.budget(step) for step in steps]
+            says &= torch.stack([says[0] | True if x is None else x >= 0 for x in left])
             total = total + self.message_bytes * says
         return {keys.BYTES_SENT: total}
 
