@@ -25,15 +25,6 @@ from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.learners.base import LEARNERS
 from emberlink.trainers.sweep.executors.base import EXECUTORS
 
-_WORDS = {
-    "integer": "whole number",
-    "number": "number",
-    "string": "text",
-    "boolean": "true or false",
-    "null": "null",
-}
-_NO_LIMIT = 1e12
-"""a limit that only excludes infinity"""
 _BOUNDS = {
     "minimum": "≥",
     "exclusiveMinimum": ">",
@@ -140,7 +131,7 @@ def _meanings(cls: type) -> dict[str, str]:
 
 
 def _type(schema: Mapping[str, Any]) -> str:
-    """Returns the type and the range of a JSON schema as text, such as "whole number ≥ 1"."""
+    """Returns the type and the range of a JSON schema as text, such as "integer ≥ 1"."""
     if "anyOf" in schema:
         return " or ".join(map(_type, schema["anyOf"]))
     if "enum" in schema or "const" in schema:
@@ -153,11 +144,9 @@ def _type(schema: Mapping[str, Any]) -> str:
     bounds = [
         f"{sign} {schema[bound]:,.10f}".rstrip("0").rstrip(".")
         for bound, sign in _BOUNDS.items()
-        if abs(schema.get(bound, _NO_LIMIT)) < _NO_LIMIT
+        if bound in schema
     ]
-    return (
-        f"{_WORDS.get(schema.get('type', ''), 'names and values')} {' and '.join(bounds)}".strip()
-    )
+    return f"{schema.get('type', 'names and values')} {' and '.join(bounds)}".strip()
 
 
 def _plain(value: Any) -> str:

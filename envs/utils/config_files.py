@@ -1,7 +1,4 @@
-"""Finds and reads the YAML files of configuration groups of emberlink, other packages and the user.
-
-A group is a folder such as `method` or `fire`. Each file in it is a choice of the group.
-"""
+"""Finds and reads YAML files: each is a choice of a group, a folder such as `method` or `fire`."""
 
 import os
 import re

@@ -231,8 +231,7 @@ def add_world(commands: Any) -> None:
     add("arguments", metavar="NAME | key=value", nargs="*", help=names)
     add("--fires", metavar="N", type=positive, default=100, help="number of fires (default: 100)")
     on_validation = {"const": "validation", "default": "test", "action": "store_const"}
-    why = "play on validation fires, for the design of a world, in place of test fires"
-    add("--validation", dest="split", help=why, **on_validation)
+    add("--validation", dest="split", help="play on validation fires instead", **on_validation)
     add("--json", dest="output", metavar="FILE", type=path, help="a new file for the numbers")
 
 

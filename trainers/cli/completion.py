@@ -1,7 +1,6 @@
 """Completes commands, methods and runs for the script of `register-python-argcomplete`."""
 
 import argparse
-import glob
 import sys
 from importlib.resources import files
 from pathlib import Path
@@ -22,13 +21,13 @@ def answer(parser: argparse.ArgumentParser) -> None:
 
 def _words(prefix: str, action: argparse.Action, **_: Any) -> list[str]:
     """Returns the words of an argument by what its help calls it."""
-    from argcomplete.completers import FilesCompleter
+    from argcomplete.completers import DirectoriesCompleter, FilesCompleter
 
     name = str(action.metavar)
     if name.startswith("METHOD"):
         return config_files.known("method")
     if name.startswith("RUN"):
-        folders = [path.rstrip("/") for path in glob.glob(f"{glob.escape(prefix)}*/")]
+        folders = DirectoriesCompleter()(prefix)
         shipped = Path(str(files("emberlink.policies"))) / "pretrained"
         paths = {file.parent.parent for file in shipped.glob("*/*/*/config.yaml")}
         names = sorted(f"pretrained:{path.relative_to(shipped)}" for path in paths)

@@ -17,14 +17,11 @@ KINDS = ("methods", "setups", "worlds", "fires", "learners", "executors", "polic
 
 
 def add_list(commands: Any) -> None:
-    add = command(
-        commands,
-        "list",
-        _list,
-        "list methods, setups, worlds, fires, learners, executors, scripted policies",
-        "Prints the names that other commands accept and what they stand for, one per line.",
-        "emberlink list worlds",
-    )
+    text = """list methods, setups, worlds, fires, learners, executors, scripted policies
+    Prints the names that other commands accept and what they stand for, one per line.
+    emberlink list worlds
+    """
+    add = command(commands, "list", _list, text)
     kinds = f"{', '.join(KINDS)} (default: all)"
     add("kinds", metavar="KIND", nargs="*", default=[], help=kinds)
 

@@ -4,8 +4,8 @@ import json
 import os
 import re
 import stat
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -170,11 +170,9 @@ class RunFolder:
         folder.mkdir(exist_ok=True)
         return folder
 
-    @contextmanager
-    def figure(self, file: str) -> Iterator[Path]:
+    def figure(self, file: str) -> AbstractContextManager[Path]:
         """Yields a path for a figure, which is renamed to figures/FILE at the end."""
-        with atomic_io.replaced(self.figures() / file) as partial:
-            yield partial
+        return atomic_io.replaced(self.figures() / file)
 
 
 class _WithoutAliases(yaml.SafeLoader):

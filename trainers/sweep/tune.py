@@ -62,8 +62,8 @@ def tune(
         study.tell(old.number, state=states.FAIL)
         study.enqueue_trial(old.params, user_attrs=old.user_attrs)
     while len(done := study.get_trials(states=(states.COMPLETE, states.PRUNED))) < trials:
-        trial = study.ask()
-        chosen = [f"{key}={_suggest(trial, key, values)}" for key, values in ranges.items()]
+        trial = study.ask(ranges)
+        chosen = [f"{key}={value}" for key, value in trial.params.items()]
         trainer = _trainer(trial, method, [*overrides, *chosen, f"output={folder}"])
         pruned = False
 
@@ -96,25 +96,25 @@ def tune(
 
 
 def _space(config: RunConfig, file: Path | None) -> dict[str, Any]:
-    """Returns the settings to try: key -> values, or low and high."""
+    """Returns the settings to try: key -> distribution."""
     file = file or config_files.find("space", config.learner.name)
-    with naming(file, yaml.YAMLError):
+    with naming(file, yaml.YAMLError, AttributeError):
         ranges = yaml.safe_load(read_bytes(file, MAX_YAML))
-        for key, values in ranges.items() if isinstance(ranges, Mapping) else [("", None)]:
-            known = isinstance(values, Mapping) and {"low", "high"} <= values.keys()
-            if not known and not (isinstance(values, list) and values):
-                raise UserError(f"{key}: {shown(values)}: expected a list, or low and high")
-    return dict(ranges)
+        return {key: _distribution(key, values) for key, values in ranges.items()}
 
 
-def _suggest(trial: Any, key: str, values: Any) -> Any:
-    """Returns the value of a setting in a trial."""
+def _distribution(key: str, values: Any) -> Any:
+    """Returns Optuna's distribution of a list, or of low, high and log."""
+    from optuna import distributions as of
+
     if isinstance(values, list):
-        return trial.suggest_categorical(key, values)
+        return of.CategoricalDistribution(values)
+    if not isinstance(values, Mapping) or not {"low", "high"} <= values.keys():
+        raise UserError(f"{key}: {shown(values)}: expected a list, or low and high")
     low, high = values["low"], values["high"]
     whole = isinstance(low, int) and isinstance(high, int)
-    draw = trial.suggest_int if whole else trial.suggest_float
-    return draw(key, low, high, log=bool(values.get("log")))
+    kind = of.IntDistribution if whole else of.FloatDistribution
+    return kind(low, high, log=bool(values.get("log")))
 
 
 def _trainer(trial: Any, method: str, overrides: Sequence[str]) -> Trainer:

@@ -2,9 +2,8 @@
 
     python -P -m emberlink.trainers.sweep.worker RUN [KEY=VALUE ...]
 
-This is `emberlink train resume=RUN KEY=VALUE ...`: a run without a checkpoint begins, a finished
-one is left as it is. The standard input is a pipe to which the parent writes nothing; it is closed
-when the parent ends, for whatever reason.
+This is `emberlink train resume=RUN KEY=VALUE ...`. The standard input is a pipe to which the parent
+writes nothing; it is closed when the parent ends, for whatever reason.
 """
 
 import os

@@ -1,6 +1,6 @@
 """Resumes a stopped run exactly where its newest checkpoint was made."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +8,6 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import differences, override
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
-from emberlink.trainers.runs import checkpoint
 from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training import warm_start
@@ -44,7 +43,6 @@ def _restored(trainer: Trainer, run: RunFolder, lock: Lock, before: RunConfig) -
     trainer.open(run, lock)
     if run.newest.exists():
         trainer.restore()
-        trainer.changed_versions = _other_versions(checkpoint.read_header(run.newest).versions)
     elif len(run.metrics()) > before.checkpoint_interval:
         raise UserError(f"{run.path}: holds no {run.newest.name}, and too many episodes for none")
     else:
@@ -56,12 +54,6 @@ def _restored(trainer: Trainer, run: RunFolder, lock: Lock, before: RunConfig) -
         if trainer.saved is not None:
             trainer.save()  # the next resume reads the configuration in the checkpoint
     return trainer
-
-
-def _other_versions(before: Mapping[str, str]) -> str:
-    """Returns the packages whose version differs from `before`; "" if there are none."""
-    now = checkpoint.versions()
-    return ", ".join(f"{k} {v} (now {now.get(k)})" for k, v in before.items() if now.get(k) != v)
 
 
 def _changed(config: RunConfig, overrides: Sequence[str], settings: dict[str, Any]) -> RunConfig:

@@ -48,9 +48,6 @@ class Trainer:
     """Trains a configuration in a run folder.
 
     The setup is built before the folder is created, so that an error leaves no files.
-
-    Args:
-        config: configuration of the run.
     """
 
     run: RunFolder
@@ -176,6 +173,11 @@ class Trainer:
         with naming(path, KeyError, RuntimeError, TypeError, IndexError):
             self.setup.load_state_dict(checkpoint.read_tensors(path), header.step)
         self.saved = header.step
+        versions = checkpoint.versions()
+        changed = {k: v for k, v in header.versions.items() if versions.get(k) != v}
+        self.changed_versions = ", ".join(
+            f"{k} {changed[k]} (now {versions.get(k)})" for k in changed
+        )
         before, now = header.config["evaluation"], self.config.evaluation
         compared = ("headline", "huygens", "interval_episodes", "interval")
         if all(before.get(key) == getattr(now, key) for key in compared):
