@@ -15,7 +15,6 @@ from sphinx.ext.napoleon.docstring import GoogleDocstring  # noqa: E402
 GoogleDocstring._consume_inline_attribute = lambda self: ("", self._consume_to_end())
 
 project = "emberlink"
-author = "the emberlink authors"
 version = release = installed("emberlink")
 
 extensions = [
@@ -25,7 +24,6 @@ extensions = [
     "reference_pages",
 ]
 exclude_patterns = ["data", "site"]
-nitpicky = False
 
 myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence"]

@@ -15,8 +15,6 @@ from emberlink import configs
 from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.utils.errors import UserError, unknown
 
-VARIABLE = "EMBERLINK_CONFIGS"
-"""environment variable with folders of groups, separated as in PATH"""
 PACKAGES = "emberlink.configs"
 """group of entry points; each names a package whose folder holds groups"""
 
@@ -33,8 +31,9 @@ def _entry_points(group: str, _: tuple[str, ...]) -> metadata.EntryPoints:
 
 
 def folders() -> list[Path]:
-    """Returns the existing folders of groups: in `VARIABLE`, of other packages, of emberlink."""
-    listed = [user_path(text) for text in os.environ.get(VARIABLE, "").split(os.pathsep) if text]
+    """Returns the folders of groups: of EMBERLINK_CONFIGS, other packages, emberlink."""
+    given = os.environ.get("EMBERLINK_CONFIGS", "").split(os.pathsep)  # as in PATH
+    listed = [user_path(text) for text in given if text]
     plugins = [path for point in entry_points(PACKAGES) for path in _package(point.value)]
     every = [path.resolve() for path in (*listed, *plugins, Path(str(configs.__file__)).parent)]
     return [path for path in dict.fromkeys(every) if path.is_dir()]

@@ -14,14 +14,13 @@ from emberlink.trainers.cli.parser import between, command, command_group, path,
 if TYPE_CHECKING:
     from rich.console import Console
 
-EXTRAS = {
+EXTRAS = {  # of `compare`, beside its page
     "csv": "compare.csv, one row per run, fire and measure",
     "latex": "compare.tex, the rankings by the world's headline measure",
     "marl-eval": "marl_eval.json, training and held-out fires in the format of MARL-eval",
     "pdf": "the figures as PDF",
     "svg": "the figures as SVG",
 }
-"""what `compare` can write beside its page -> its help"""
 _OVERRIDES: dict[str, Any] = {"metavar": "key=value", "nargs": "*", "default": []}
 _REPEATABLE: dict[str, Any] = {"action": "append", "default": []}
 

@@ -146,8 +146,7 @@ def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
     """
     actor = build_actor(config, empty_env(config))
     network: Any = actor.module
-    expected = {ACTOR + name: value for name, value in network.state_dict().items()}
-    weights = load_weights(checkpoint, expected, config)
+    weights = load_weights(checkpoint, network, config)
     trained, compared = read_header(checkpoint).config, units(config)
     if config.env.observation == "map" and trained["env"]["base"] is None:
         compared += ("env.base",)

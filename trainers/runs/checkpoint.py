@@ -96,13 +96,9 @@ def read_tensors(path: Path, prefix: str = "") -> dict[str, Tensor]:
         return {name.removeprefix(prefix): file.get_tensor(name) for name in chosen}
 
 
-def load_weights(
-    path: Path, expected: Mapping[str, Tensor], config: RunConfig
-) -> dict[str, Tensor]:
-    """Returns the weights of a checkpoint, which have the names, shapes and types of `expected`.
-
-    `config` is the configuration of the networks that get the weights, for messages.
-    """
+def load_weights(path: Path, network: Any, config: RunConfig) -> dict[str, Tensor]:
+    """Returns the weights of a checkpoint, which fit the actors `network` of a configuration."""
+    expected = {ACTOR + name: value for name, value in network.state_dict().items()}
     header, every = read_header(path), read_tensors(path, WEIGHTS)
     weights = {k: v for k, v in every.items() if k.startswith(ACTOR) or k in expected}
     try:

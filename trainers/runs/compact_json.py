@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 
@@ -16,17 +16,17 @@ def dumps(value: Any) -> str:
 
 def finite(value: Any) -> Any:
     """Returns a value with the texts "inf" and "-inf" for infinite numbers, which JSON lacks."""
-    if isinstance(value, Mapping):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    return str(value) if isinstance(value, float) and math.isinf(value) else value
+    return _changed(value, lambda x: str(x) if isinstance(x, float) and math.isinf(x) else x)
 
 
 def infinite(value: Any) -> Any:
     """Returns a value with infinite numbers for the texts "inf" and "-inf"."""
-    if isinstance(value, dict):
-        return {key: infinite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [infinite(item) for item in value]
-    return float(value) if isinstance(value, str) and value in ("inf", "-inf") else value
+    return _changed(value, lambda x: float(x) if x in ("inf", "-inf") else x)
+
+
+def _changed(value: Any, change: Callable[[Any], Any]) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _changed(item, change) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_changed(item, change) for item in value]
+    return change(value)

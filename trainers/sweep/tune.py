@@ -55,9 +55,10 @@ def tune(
         storage=optuna.storages.JournalStorage(journal),
         study_name="emberlink",
         direction="maximize" if headline in metrics.HIGHER_IS_BETTER else "minimize",
-        sampler=optuna.samplers.TPESampler(seed=config.seed),
         load_if_exists=True,
     )
+    # Of a seed alone, the sampler would repeat the first draws of the earlier command.
+    study.sampler = optuna.samplers.TPESampler(seed=config.seed + len(study.trials))
     for old in study.get_trials(states=(states.RUNNING,)):
         study.tell(old.number, state=states.FAIL)
         study.enqueue_trial(old.params, user_attrs=old.user_attrs)

@@ -12,9 +12,6 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.table import Table
 
-_WITHOUT_TERMINAL = 1000
-"""columns of a pipe or a file"""
-
 plain_table = partial(
     Table,
     box=box.SIMPLE_HEAD,
@@ -37,7 +34,7 @@ class SafeConsole(Console):
     def __init__(self) -> None:
         super().__init__(markup=False, emoji=False, highlight=False)
         if not self.is_terminal and "COLUMNS" not in os.environ:
-            self.width = _WITHOUT_TERMINAL
+            self.width = 1000  # columns of a pipe or a file
 
     def print(self, *objects: Any, **options: Any) -> None:
         tables = [part for item in objects if isinstance(item, Table) for part in self._parts(item)]

@@ -1,7 +1,6 @@
 """Begins a run with the actors of another run (`learner.warm_start`)."""
 
 import warnings
-from typing import Any
 
 from emberlink.comm.base import MODULES
 from emberlink.envs.utils.errors import UserError
@@ -9,7 +8,7 @@ from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import differences
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.policy import units
-from emberlink.trainers.learners.base import ACTOR, Learner
+from emberlink.trainers.learners.base import Learner
 from emberlink.trainers.runs.checkpoint import load_weights
 from emberlink.trainers.runs.pretrained import read_run
 
@@ -22,12 +21,10 @@ def start(learner: Learner, config: RunConfig) -> None:
     name = getattr(config.learner, "warm_start", "")
     if not name:
         return
-    network: Any = learner.actor.module
-    expected = {ACTOR + key: value for key, value in network.state_dict().items()}
     try:
         run = read_run(name)
         theirs = run.config()
-        weights = load_weights(run.checkpoint(), expected, config)
+        weights = load_weights(run.checkpoint(), learner.actor.module, config)
     except UserError as error:
         said = str(error).removeprefix(f"{name}: ")
         raise UserError(f"learner.warm_start={name}: {said}") from None

@@ -130,7 +130,7 @@ def test_import_of_several_files(capsys, tmp_path):
     [
         (["preview", "huygns"], ["huygns", "did you mean huygens?", "known: front, huygens"]),
         (["preview", "bank.npy:2"], ["bank.npy", "no fire '2'", "0 to 1"]),
-        (["preview", "folder"], ["folder", "expected a file"]),
+        (["preview", "folder"], ["folder", "perimeters"]),
         (["preview", "paper", "fire.units=minutes"], ["fire.units"]),
         (["preview", "paper", "--output", "there.png"], ["there.png exists already"]),
         (["import", "300.npy", "--output", "a.tif"], ["a.tif", "must end in .npy"]),

@@ -36,7 +36,7 @@ def test_an_interrupted_trial_goes_on_with_its_settings(tmp_path, space, monkeyp
     def dies(self, report):
         def stop(state):
             report(state)
-            if state.step == 30:
+            if state.step >= 30:
                 raise SystemExit(9)
 
         train(self, stop)

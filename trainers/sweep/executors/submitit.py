@@ -97,8 +97,7 @@ class _Handle:
     """A submitted task; `seen` is when its job was last in the queue."""
 
     def __init__(self, task: Task, job: Any):
-        self.task, self.job = task, job
-        self.seen, self.grace = time.monotonic(), _GRACE
+        self.task, self.job, self.seen, self.grace = task, job, time.monotonic(), _GRACE
 
 
 class SubmititExecutor(Executor):
