@@ -102,9 +102,9 @@ class Learner(ABC):
     """Trains the networks of all UAVs.
 
     A learner owns the networks, their updates, the transitions that it learns from, and the
-    exploration policy. A subclass sets `actor`, `loss`, `optimizer`, and a `generator` if it draws
-    random numbers after `__init__`; these are saved. Other state is added by the subclass's
-    `state_dict` and `load_state_dict`.
+    exploration policy. A subclass sets `actor`, `loss` and `optimizer`, a `generator` if it draws
+    random numbers after `__init__`, and `replay` if it has a replay buffer; these are saved. Other
+    state is added by the subclass's `state_dict` and `load_state_dict`.
     """
 
     config_type: ClassVar[type[LearnerConfig]]
@@ -119,6 +119,8 @@ class Learner(ABC):
     """of all parameters that are trained"""
     generator: torch.Generator | None = None
     """draws exploration, batches and everything else after `__init__`"""
+    replay: Any = None
+    """the replay buffer, if there is one; its state is saved"""
     rollout_steps: int = 1
     """decisions of the batch of environments per call of `learn`; must divide the horizon"""
     learning_starts: int = 0
@@ -185,7 +187,9 @@ class Learner(ABC):
     def state_dict(self) -> dict[str, Tensor]:
         """Returns the state that learning changes, by name."""
         generator = {} if self.generator is None else {"state": self.generator.get_state()}
+        replay = {} if self.replay is None else self.replay.state_dict()
         return prefixed(
+            replay=replay,
             weights=self.weights(),
             networks=self._other_networks(),
             optimizer=optimizer_tensors(self.optimizer),
@@ -205,6 +209,8 @@ class Learner(ABC):
         self.updates = int(state["counters/updates"])
         if self.generator is not None:
             self.generator.set_state(state["generator/state"].cpu())
+        if self.replay is not None:
+            self.replay.load_state_dict(group(state, "replay"))
 
     def _other_networks(self) -> dict[str, Tensor]:
         """Returns the tensors of the loss by name, without the actors' weights."""

@@ -1,6 +1,7 @@
 """DDPG for all UAVs (Lillicrap et al. 2016; paper, section III.C)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import torch
@@ -27,7 +28,6 @@ from emberlink.trainers.learners.base import (
     mean_over_batch,
 )
 from emberlink.trainers.learners.replay import DONE, TERMINATED, TeamReplay, to_batch, to_rows
-from emberlink.trainers.learners.tensors import group, prefixed
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -77,7 +77,8 @@ class DDPG(Learner):
         specs, policy = (context.observation_spec, context.action_spec), context.policy
         initial = torch.Generator().manual_seed(context.seed)
         self.actor = self.make_actor(config, *specs, initial, policy)
-        critic = make_critic(
+        critic = partial(
+            make_critic,
             *specs,
             config.hidden,
             share_parameters=config.share_parameters,
@@ -91,18 +92,20 @@ class DDPG(Learner):
         modules: list[Any] = [self.actor, noise]
         self.explorer = TensorDictSequential(*modules)
         # Losses and target networks.
-        loss = DDPGLoss(self.actor, critic, delay_actor=True, delay_value=True, reduction="none")
-        loss.set_keys(
+        self.loss, critics = self._make_loss(critic)
+        self.loss.set_keys(
             state_action_value=STATE_ACTION_VALUE,
             reward=keys.REWARD,
             done=DONE,
             terminated=TERMINATED,
         )
-        loss.make_value_estimator(gamma=config.gamma)
-        self.loss, self.targets = loss, SoftUpdate(loss, tau=config.tau)
+        self.loss.make_value_estimator(gamma=config.gamma)
+        self.targets = SoftUpdate(self.loss, tau=config.tau)
         # Optimizer.
-        actors = list(loss.actor_network_params.values(True, True))
-        critics = list(loss.value_network_params.values(True, True))
+        actors, critics = (
+            list(weights.values(True, True))
+            for weights in (self.loss.actor_network_params, critics)
+        )
         decay = config.critic_weight_decay
         self.optimizer = group_optimizers(
             torch.optim.Adam(actors, lr=config.actor_lr, fused=True),
@@ -119,6 +122,11 @@ class DDPG(Learner):
             mixed=not (config.share_parameters and policy.agent_index),
         )
         self.learning_starts = self.replay.learning_starts
+
+    def _make_loss(self, critic: Callable[[], Any]) -> tuple[Any, Any]:
+        """Returns TorchRL's loss and its critics' weights, given what makes a critic."""
+        loss = DDPGLoss(self.actor, critic(), delay_actor=True, delay_value=True, reduction="none")
+        return loss, loss.value_network_params
 
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
         """Stores a rollout, and performs updates if there is a full batch."""
@@ -152,10 +160,3 @@ class DDPG(Learner):
         """Begins with the actors of another run, and target actors like them."""
         self.copy_actor(weights)
         self.targets = SoftUpdate(self.loss, tau=self.config.tau)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return super().state_dict() | prefixed(replay=self.replay.state_dict())
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        super().load_state_dict(state)
-        self.replay.load_state_dict(group(state, "replay"))

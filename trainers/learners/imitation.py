@@ -193,13 +193,11 @@ class Imitation(Learner):
     def state_dict(self) -> dict[str, Tensor]:
         recent: Any = torch.cat(self._recent, 1) if self._recent else TensorDict({})  # pyright: ignore[reportArgumentType]
         return super().state_dict() | prefixed(
-            replay=self.replay.state_dict(),
             recent=flatten(recent) | {"decisions": torch.tensor(self.decisions)},
         )
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         super().load_state_dict(state)
-        self.replay.load_state_dict(group(state, "replay"))
         recent = group(state, "recent")
         self.decisions = int(recent.pop("decisions"))
         whole: Any = unflatten(recent, 2, self.context.device) if recent else None
