@@ -50,14 +50,14 @@ class Use(IntEnum):
 
 def _shift(x: Tensor, bits: int) -> Tensor:
     """Shifts right logically; torch's `>>` on int64 is arithmetic."""
-    return (x >> bits) & ((1 << (64 - bits)) - 1)
+    return (x >> bits).bitwise_and_((1 << (64 - bits)) - 1)
 
 
 def _mix(x: Tensor) -> Tensor:
     """Applies the finaliser of SplitMix64 (Steele, Lea and Flood 2014, OOPSLA, figure 17)."""
-    x = (x ^ _shift(x, 30)) * _MIX_A
-    x = (x ^ _shift(x, 27)) * _MIX_B
-    return x ^ _shift(x, 31)
+    x = _shift(x, 30).bitwise_xor_(x).mul_(_MIX_A)
+    x = _shift(x, 27).bitwise_xor_(x).mul_(_MIX_B)
+    return _shift(x, 31).bitwise_xor_(x)
 
 
 def fold_in(key: Tensor, counter: Tensor | int) -> Tensor:
@@ -96,7 +96,7 @@ def check_seeds(seed: int | Sequence[int], num_envs: int) -> list[int]:
 def uniform(key: Tensor, count: int) -> Tensor:
     """Returns `count` numbers per key, uniform in (0, 1): odd multiples of 2⁻²⁴, float32."""
     bits = fold_in(key.unsqueeze(-1), torch.arange(count, device=key.device))
-    return (_shift(bits, 41).to(torch.float32) + 0.5) * 2.0**-23
+    return _shift(bits, 41).to(torch.float32).add_(0.5).mul_(2.0**-23)
 
 
 def normal(key: Tensor, count: int) -> Tensor:

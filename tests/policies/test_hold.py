@@ -154,10 +154,10 @@ def test_learners_receive_decisions(learner):
     setup.learner.learn = lambda rollout: received.append(rollout) or learn(rollout)
     setup.dry_run(40)
     assert setup.step == 40
-    assert len(received) == 8
-    assert all(rollout.shape == (2, 1) for rollout in received)
-    assert [int(rollout[keys.STEP][0]) for rollout in received] == [0, 5, 10, 15] * 2
-    actions = torch.cat([rollout[keys.ACTION] for rollout in received], 1)
+    decisions = torch.cat(received, 1)
+    assert decisions.shape == (2, 8)
+    assert decisions[keys.STEP][0].tolist() == [0, 5, 10, 15] * 2
+    actions = decisions[keys.ACTION]
     assert not actions[:, 1:].isclose(actions[:, :-1]).any()  # noise is drawn at each decision
 
 
