@@ -17,12 +17,7 @@ GoogleDocstring._consume_inline_attribute = lambda self: ("", self._consume_to_e
 project = "emberlink"
 version = release = installed("emberlink")
 
-extensions = [
-    "myst_nb",
-    "sphinx.ext.autodoc",
-    "sphinx.ext.napoleon",
-    "reference_pages",
-]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "reference_pages"]
 exclude_patterns = ["data", "site"]
 
 myst_heading_anchors = 4

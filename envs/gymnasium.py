@@ -16,8 +16,6 @@ from tensordict import TensorDictBase
 from emberlink.envs import keys
 from emberlink.envs.pettingzoo import WildfireParallelEnv, parallel_env, to_action
 
-ID = "emberlink/WildfireTeam-v0"
-
 
 class WildfireTeamEnv(gymnasium.Env[Any, NDArray[np.float32]]):
     """One agent that observes all UAVs, float32 [n * features], and moves all, float32 [n * 3].
@@ -90,4 +88,4 @@ class WildfireTeamEnv(gymnasium.Env[Any, NDArray[np.float32]]):
         self._team.close()
 
 
-gymnasium.register(id=ID, entry_point=f"{__name__}:WildfireTeamEnv")
+gymnasium.register(id="emberlink/WildfireTeam-v0", entry_point=f"{__name__}:WildfireTeamEnv")

@@ -133,13 +133,6 @@ class FromFile(FireSource):
         return dataclasses.replace(self.config, saved_copy=str(folder / COPY_FILE))
 
 
-_KINDS: dict[type, Any] = {
-    FireConfig: Generated,
-    ReactionConfig: Generated,
-    FileFireConfig: FromFile,
-}
-
-
 def _kind(value: Any) -> str:
     """Returns the tag of a scenario; one without a `kind` is of the level set."""
     kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
@@ -159,7 +152,8 @@ Scenario = Annotated[
 
 def fires_of(scenario: ScenarioConfig) -> FireSource:
     """Returns the fires of a scenario."""
-    return _KINDS[type(scenario)](scenario)
+    of_file = isinstance(scenario, FileFireConfig)
+    return FromFile(scenario) if of_file else Generated(scenario)
 
 
 def same_tests(one: ScenarioConfig, other: ScenarioConfig) -> bool:

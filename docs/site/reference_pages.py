@@ -25,12 +25,7 @@ from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.learners.base import LEARNERS
 from emberlink.trainers.sweep.executors.base import EXECUTORS
 
-_BOUNDS = {
-    "minimum": "≥",
-    "exclusiveMinimum": ">",
-    "maximum": "≤",
-    "exclusiveMaximum": "<",
-}
+_BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 _SKIPPED = {"comm", "learner", "fire", "saved_copy", "sha256", "test_sha256"}
 
 

@@ -140,10 +140,9 @@ def _compare(options: argparse.Namespace, console: "Console") -> int:
 
     folder = free_folder(options.output)
     comparison = compare_runs(options.folders, options.label)
-    for run, why in comparison.left_out:
-        say(f"note: {run} is left out: {why}")
     write_report(comparison, folder, lambda text: say(f"  {text}", "dim"), options.extras)
-    for note in comparison.notes:
+    left_out = [f"{run} is left out: {why}" for run, why in comparison.left_out]
+    for note in (*left_out, *comparison.notes):
         say(f"note: {note}")
     for section in comparison.sections:
         for table in tables(comparison, section):

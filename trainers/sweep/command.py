@@ -18,9 +18,6 @@ from emberlink.trainers.terminal.console import plain_table
 from emberlink.trainers.terminal.signals import Interruption
 from emberlink.trainers.training.setup import check_setup
 
-_INTERVAL = 0.5
-"""seconds between two looks at the runs"""
-
 
 def sweep(
     arguments: Sequence[str],
@@ -132,7 +129,7 @@ class _Trainings:
             state = "failed" if run.failed else "finished" if run.finished else "stopped"
             self._say(f"{run.name}: {state}")
         if self._running:
-            time.sleep(_INTERVAL)
+            time.sleep(0.5)
 
     def _say(self, text: str) -> None:
         """Prints a line above the bar."""

@@ -17,9 +17,6 @@ from pathlib import Path
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.runs.lock import Lock
 
-_PATIENCE = 60
-"""seconds in which an earlier process of the run may save and end"""
-
 
 def _end_with_parent() -> None:
     os.read(0, 1)
@@ -29,7 +26,7 @@ def _end_with_parent() -> None:
 if __name__ == "__main__":
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(UserError):  # `train` reports it
-        Lock(Path(sys.argv[1]), _PATIENCE).release()
+        Lock(Path(sys.argv[1]), patience=60).release()  # an earlier process may save and end
     sys.argv[1:2] = ["train", f"resume={sys.argv[1]}"]
     # By name, since importing the command line here would be circular.
     runpy.run_module("emberlink.trainers.cli", run_name="__main__", alter_sys=True)
