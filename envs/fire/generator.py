@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, get_args
 
 import torch
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
@@ -35,7 +35,7 @@ from emberlink.envs.fire.ranges import (
 from emberlink.envs.fire.reaction import ReactionConfig, reaction_fires
 from emberlink.envs.utils.config_files import find, known, read
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import Name, describe
+from emberlink.envs.utils.validation import STRICT, Name, describe
 
 Split = Literal["train", "validation", "test"]
 
@@ -53,11 +53,7 @@ _Period = Annotated[float, Field(ge=100, le=1e6)]
 _Count = Annotated[int, Field(ge=0, le=32)]
 
 
-@dataclass(
-    frozen=True,
-    kw_only=True,
-    config=ConfigDict(extra="forbid", strict=True, use_attribute_docstrings=True),
-)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class FireConfig:
     """A distribution of fires: each pair (low, high) is the range of a uniform draw."""
 

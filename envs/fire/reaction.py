@@ -19,7 +19,7 @@ from collections.abc import Callable
 from typing import Annotated, Literal
 
 import torch
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 from torch.nn.functional import pad
@@ -37,7 +37,7 @@ from emberlink.envs.fire.ranges import (
     unit_draws,
 )
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import Name
+from emberlink.envs.utils.validation import STRICT, Name
 
 Reaction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """from temperature rise and fuel to their rates of change"""
@@ -51,11 +51,7 @@ _Wind = Annotated[float, Field(ge=0, le=10)]
 _Kelvin = Annotated[float, Field(ge=200, le=3000)]
 
 
-@dataclass(
-    frozen=True,
-    kw_only=True,
-    config=ConfigDict(extra="forbid", strict=True, use_attribute_docstrings=True),
-)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class ReactionConfig:
     """A distribution of fires of the heat equation: a pair is the range of a uniform draw."""
 
