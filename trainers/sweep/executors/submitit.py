@@ -5,8 +5,9 @@ import signal
 import subprocess
 import time
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import redirect_stderr, suppress
 from importlib import import_module
+from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -117,7 +118,8 @@ class SubmititExecutor(Executor):
     def submit(self, tasks: Sequence[Task]) -> Sequence[_Handle]:
         try:
             executor = self._make(tasks[0].log.parent / "submitit")
-            with executor.batch():
+            # submitit also prints sbatch's messages.
+            with redirect_stderr(StringIO()), executor.batch():
                 jobs = [executor.submit(_Training(task, self._config.cpus)) for task in tasks]
         except (RuntimeError, OSError, ValueError, subprocess.CalledProcessError) as error:
             lines = [line.removeprefix("sbatch: error: ") for line in str(error).splitlines()]
