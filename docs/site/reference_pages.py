@@ -25,6 +25,7 @@ from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.learners.base import LEARNERS
 from emberlink.trainers.sweep.executors.base import EXECUTORS
 
+_FLOW: Any = {"default_flow_style": True, "width": math.inf}
 _BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 _SKIPPED = {"comm", "learner", "fire", "saved_copy", "sha256", "test_sha256"}
 
@@ -108,8 +109,12 @@ def _keys(cls: type, prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[s
         about = schema["properties"][name]
         empty = {} if cls.__pydantic_fields__[name].default_factory else MISSING
         default = values.get(name, about.get("default", empty))
-        shown = "by choice" if default is MISSING else f"`{_plain(default)}`"
-        yield f"`{prefix}{name}`", shown, f"{meanings.get(name, '')}; {_type(about)}"
+        as_yaml = "" if default is MISSING else yaml.safe_dump([default], **_FLOW)[1:-2]
+        yield (
+            f"`{prefix}{name}`",
+            f"`{as_yaml}`" if as_yaml else "by choice",
+            f"{meanings.get(name, '')}; {_type(about)}",
+        )
 
 
 def _meanings(cls: type) -> dict[str, str]:
@@ -142,11 +147,6 @@ def _type(schema: Mapping[str, Any]) -> str:
         if bound in schema
     ]
     return f"{schema.get('type', 'names and values')} {' and '.join(bounds)}".strip()
-
-
-def _plain(value: Any) -> str:
-    """Returns a value as YAML shows it."""
-    return yaml.safe_dump([value], default_flow_style=True, width=math.inf)[1:-2]
 
 
 def _first(doc: str | None) -> str:

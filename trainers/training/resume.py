@@ -29,7 +29,11 @@ def resume(
     before = run.config()
     if method is not None and method != before.method:
         raise UserError(f"method {method!r}: the run is of method {before.method!r}")
-    config = _changed(before, overrides, settings)
+    config = override(before, overrides, **settings)
+    for key, (new, old) in differences(config, before).items():
+        if key not in MAY_CHANGE and not key.startswith("evaluation."):
+            given = f"{key}={shown(new)}"
+            raise UserError(f"{given}: the run has {key}={shown(old)}; a resumed run keeps it")
     lock = Lock(run.path)
     try:
         return _restored(Trainer(config), run, lock, before)
@@ -54,14 +58,3 @@ def _restored(trainer: Trainer, run: RunFolder, lock: Lock, before: RunConfig) -
         if trainer.saved is not None:
             trainer.save()  # the next resume reads the configuration in the checkpoint
     return trainer
-
-
-def _changed(config: RunConfig, overrides: Sequence[str], settings: dict[str, Any]) -> RunConfig:
-    """Returns the configuration with the overrides; refuses keys that may not change."""
-    changed = override(config, overrides, **settings)
-    for key, (new, old) in differences(changed, config).items():
-        if key not in MAY_CHANGE and not key.startswith("evaluation."):
-            raise UserError(
-                f"{key}={shown(new)}: the run has {key}={shown(old)}; a resumed run keeps it"
-            )
-    return changed
