@@ -68,7 +68,7 @@ def test_front_speed_supports_the_wavelet(ratio: float):
     torch.testing.assert_close(speed, reach, atol=1e-6, rtol=0)
 
 
-# Area ratio and intersection over union measured at n = 31, 61, 121, in docs/fire.md.
+# Area ratio and intersection over union measured at n = 31, 61, 121.
 ACCURACY = [
     pytest.param(1.0, STRAIGHT, (0.977, 0.992, 0.999), id="circle"),
     pytest.param(3.0, STRAIGHT, (0.992, 0.992, 0.998), id="ellipse"),
