@@ -51,8 +51,8 @@ test-cluster: $(INSTALLED)  ## test sweeps on SLURM and Ray (15 to 40 minutes; r
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -p no:xdist -o python_files='cluster_*.py' tests/cluster
 
 # Each in an environment of its own, since BenchMARL needs an older torchrl.
-test-clients: $(INSTALLED)  ## train with BenchMARL, Stable-Baselines3 and plain PyTorch (10 minutes)
-	@mkdir -p build/clients; for client in benchmarl_page:benchmarl sb3:stable-baselines3 ppo:pip; do \
+test-clients: $(INSTALLED)  ## train with BenchMARL, Stable-Baselines3, RLlib and plain PyTorch (15 minutes)
+	@mkdir -p build/clients; for client in benchmarl_page:benchmarl sb3:stable-baselines3 "rllib:ray[rllib]" ppo:pip; do \
 		name=$${client%%:*}; venv=$(VENV)/clients/$$name; \
 		[ -e $$venv/installed ] || { $(PYTHON) -m venv $$venv && \
 			$$venv/bin/pip install -q "$$(grep '^torch==' constraints.txt)" $${client##*:} -e . && \
