@@ -30,7 +30,7 @@ def act(observation):
     read = torch.as_tensor(observation).flatten(0, 1)
     with torch.no_grad():
         inputs = module.forward_inference({Columns.OBS: read})[Columns.ACTION_DIST_INPUTS]
-    return np.clip(inputs[..., :3].reshape(observation.shape[:2] + (3,)).numpy(), -1, 1)
+    return np.clip(inputs[..., :3].reshape((*observation.shape[:2], 3)).numpy(), -1, 1)
 
 
 settings = {**WORLD, "scripted": False}
