@@ -11,7 +11,6 @@ import yaml
 from refusal import refused
 from tiny_run import TINY
 
-from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import flat, to_values
 from emberlink.trainers.evaluation.policy import load_actor
@@ -73,17 +72,6 @@ def test_packed_runs_omit_the_training_state(packed):
             assert weight.equal(packed_actor.state_dict()[name])
 
 
-def test_a_packed_run_names_no_path_of_its_warm_start(packed, tmp_path):
-    _, (start, *_) = packed
-    arguments = ["setup=tuned", *TINY, f"learner.warm_start={start}", f"output={tmp_path / 'runs'}"]
-    assert main(["train", "consensus", *arguments]) == 0
-    (run,) = (tmp_path / "runs").iterdir()
-    mine = RunFolder(pack(RunFolder(run), tmp_path / "shipped"))
-    assert mine.config().learner.warm_start == f"runs/{start.name}"
-    for file in (mine.path / "config.yaml", mine.checkpoint()):
-        assert str(start.parent).encode() not in file.read_bytes()
-
-
 def test_a_name_replaces_a_run_folder(shipped, tmp_path, capsys):
     assert main(["eval", "pretrained:consensus"]) == 0
     folder = tmp_path / "runs" / "pretrained_tuned_consensus_s3"
@@ -132,19 +120,6 @@ def test_names_of_several_policies(shipped):
     assert names("pretrained:tuned/consensus/10") == ["consensus/s10"]
     assert names("pretrained:tuned_front") == ["positional/s1"]
     assert names("pretrained:positional") == ["positional/s1"]  # tuned has none
-
-
-def test_only_finished_runs_are_packed_without_overwriting(packed, tmp_path):
-    root, (run, *_) = packed
-    with pytest.raises(UserError, match="exists already"):
-        pack(RunFolder(run), root)
-    copy = tmp_path / "copy"
-    shutil.copytree(run, copy)
-    evaluation = json.loads((copy / "eval.json").read_text())
-    (copy / "eval.json").write_text(json.dumps(evaluation | {"step": 1}))
-    with pytest.raises(UserError, match="not finished"):
-        pack(RunFolder(copy), tmp_path / "new")
-    assert not (tmp_path / "new").exists()
 
 
 def test_every_shipped_policy_loads():

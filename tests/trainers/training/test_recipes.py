@@ -136,11 +136,3 @@ def test_evaluations_and_checkpoints_follow_their_intervals(tmp_path, monkeypatc
     assert {path.name for path in run.path.iterdir()} == {
         *("config.yaml", "metrics.jsonl", "checkpoint.safetensors", BEST, "lock"),
     }
-
-
-def test_several_updates_a_step(tmp_path):
-    config = short(
-        "shared_memory", tmp_path, "episodes=1", "env.horizon=20", "learner.updates_per_step=3"
-    )
-    trainer = trained(config)
-    assert trainer.setup.learner.updates == 3 * (20 - 1)  # a batch is full from step 2
