@@ -57,6 +57,8 @@ class Exchange(nn.Module):
     """int64 [envs, r, r]: step of the last message that a radio (row) received, -1 for none"""
     got: Tensor
     """bool [envs, r, r]: the messages that a radio (row) received at the last step"""
+    codes: Tensor
+    """int32 [envs, delay + 1, r, items]: the codes in flight of the entries said at a step"""
     acknowledged: Tensor
     """bool [envs, r, r]: the messages of a radio (row) that others acknowledged at the last step"""
     sizes: Tensor
@@ -90,8 +92,9 @@ class Exchange(nn.Module):
         nothing = torch.tensor(_NOTHING, dtype=torch.int32)
         self.register_buffer("told", nothing.repeat(self.shape))
         self.register_buffer("has", nothing.repeat(*self.shape, radios))
-        self.messages = Late(config.delay, envs, nothing, radios, items)
+        self.register_buffer("codes", nothing.repeat(envs, config.delay + 1, radios, items))
         no = torch.tensor(False)
+        self.messages = Late(config.delay, envs, no, radios, items)
         self.links, self.acks = (Late(config.delay, envs, no, radios, radios) for _ in range(2))
 
     def start_episodes(self, mask: Tensor) -> None:
@@ -132,16 +135,23 @@ class Exchange(nn.Module):
             return sent, hears, self._listen(known, entry, code, hears)
         now = hears & (sent > 0).unsqueeze(1)
         if self.config.delay:
-            said = torch.full(self.shape, _NOTHING, dtype=torch.int32, device=entry.device)
-            said.view(-1)[entry] = code
-            said = self.messages(step, said).view(-1)
-            entry = (said != _NOTHING).nonzero().squeeze(-1)
-            code = said[entry]
+            said = torch.zeros(self.shape, dtype=torch.bool, device=entry.device)
+            said.view(-1)[entry] = True
+            self.codes.view(-1)[self._in_flight(entry, step)] = code
+            said = self.messages(step, said)
+            entry = _marked(said, torch.ones_like(said[..., 0]))
+            code = self.codes.view(-1)[self._in_flight(entry, step - self.config.delay)]
         arrives = self.links(step, now)
         self.acknowledged.copy_(arrives & self.acks(step, self.got).mT)
         self.got.copy_(arrives)
         self.heard.copy_(torch.where(arrives, step.view(-1, 1, 1), self.heard))
         return sent, arrives, self._listen(known, entry, code, arrives)
+
+    def _in_flight(self, entry: Tensor, step: Tensor) -> Tensor:
+        """Returns the indices into the flat `codes` of entries said at steps, int64 [envs]."""
+        a_step, slots = self.shape[1] * self.shape[2], self.config.delay + 1
+        env = entry // a_step
+        return (env * (slots - 1) + (step % slots)[env]) * a_step + entry
 
     def _speak(
         self, known: Knowledge, near: Tensor, step: Tensor, left: Tensor | None

@@ -59,13 +59,14 @@ class Channel(nn.Module):
         """
         config, places = self.config, self.places(position)
         linked = self.in_range(position, alive)
+        uses = [(Use.MESSAGE_LOSS, Use.REPORT_LOSS)] * (config.loss > 0)
+        uses += [(Use.MESSAGE_FADE, Use.REPORT_FADE)] * config.fade
+        units = self._draw(rng_key, step, uses) if uses else []
         if config.loss:
-            unit = self._draw(rng_key, step, Use.MESSAGE_LOSS, Use.REPORT_LOSS)
+            unit = units[0]
             linked &= ~(self._spells(unit, step) if config.burst > 1 else unit < config.loss)
         if config.fade:
-            far = pairwise_distance(places) / config.range
-            unit = self._draw(rng_key, step, Use.MESSAGE_FADE, Use.REPORT_FADE)
-            linked &= unit >= fade(far)
+            linked &= units[-1] >= fade(pairwise_distance(places) / config.range)
         return linked
 
     def places(self, position: Tensor) -> Tensor:
@@ -79,21 +80,22 @@ class Channel(nn.Module):
             alive = nn.functional.pad(alive, (0, len(self.base)), value=True)
         return in_range(self.config, self.places(position), alive)
 
-    def _draw(self, rng_key: Tensor, step: Tensor, use: Use, with_base: Use) -> Tensor:
-        """Returns a number from 0 to 1 for each pair, float32 [..., r, r]."""
+    def _draw(self, rng_key: Tensor, step: Tensor, uses: list[tuple[Use, Use]]) -> list[Tensor]:
+        """Returns a number from 0 to 1 for each pair and use, float32 [..., r, r] each.
+
+        The first of two uses is for pairs of UAVs, the second one for pairs with the base.
+        """
         radios = self.bad.shape[-1]
-        uavs = radios - len(self.base)
-
-        def drawn(purpose: Use, side: int) -> Tensor:
-            key = counter_rng.step_key(rng_key, step, purpose)
-            return counter_rng.uniform(key, side * side).unflatten(-1, (side, side))
-
-        pairs = drawn(use, uavs)
+        uavs, pairs = radios - len(self.base), len(uses)
+        use = torch.tensor(uses, device=step.device).T.flatten()[: pairs * (1 + len(self.base))]
+        key = counter_rng.step_key(rng_key.unsqueeze(-1), step.unsqueeze(-1), use)
+        unit = counter_rng.uniform(key, radios * radios)
+        of_uavs = unit[..., :pairs, : uavs * uavs].unflatten(-1, (uavs, uavs))
         if uavs == radios:
-            return pairs
-        unit = drawn(with_base, radios)
-        unit[..., :uavs, :uavs] = pairs
-        return unit
+            return list(of_uavs.unbind(-3))
+        unit = unit[..., pairs:, :].unflatten(-1, (radios, radios))
+        unit[..., :uavs, :uavs] = of_uavs
+        return list(unit.unbind(-3))
 
     def _spells(self, unit: Tensor, step: Tensor) -> Tensor:
         """Returns which links are in a bad spell, bool like `unit`; see `RadioConfig.burst`.
@@ -138,8 +140,9 @@ class Late(nn.Module):
         env = torch.arange(len(step), device=step.device)
         self.sent[env, step % (self.delay + 1)] = now
         then = self.sent[env, (step - self.delay) % (self.delay + 1)]
-        early = (step < self.delay).view(-1, *[1] * (then.ndim - 1))
-        return then.masked_fill(early, self.blank)
+        early = step < self.delay
+        then[early] = self.blank
+        return then
 
 
 def fade(far: Tensor) -> Tensor:
