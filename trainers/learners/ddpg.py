@@ -1,7 +1,6 @@
 """DDPG for all UAVs (Lillicrap et al. 2016; paper, section III.C)."""
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import torch
@@ -77,8 +76,7 @@ class DDPG(Learner):
         specs, policy = (context.observation_spec, context.action_spec), context.policy
         initial = torch.Generator().manual_seed(context.seed)
         self.actor = self.make_actor(config, *specs, initial, policy)
-        critic = partial(
-            make_critic,
+        critic = make_critic(
             *specs,
             config.hidden,
             share_parameters=config.share_parameters,
@@ -92,20 +90,18 @@ class DDPG(Learner):
         modules: list[Any] = [self.actor, noise]
         self.explorer = TensorDictSequential(*modules)
         # Losses and target networks.
-        self.loss, critics = self._make_loss(critic)
-        self.loss.set_keys(
+        loss = DDPGLoss(self.actor, critic, delay_actor=True, delay_value=True, reduction="none")
+        loss.set_keys(
             state_action_value=STATE_ACTION_VALUE,
             reward=keys.REWARD,
             done=DONE,
             terminated=TERMINATED,
         )
-        self.loss.make_value_estimator(gamma=config.gamma)
-        self.targets = SoftUpdate(self.loss, tau=config.tau)
+        loss.make_value_estimator(gamma=config.gamma)
+        self.loss, self.targets = loss, SoftUpdate(loss, tau=config.tau)
         # Optimizer.
-        actors, critics = (
-            list(weights.values(True, True))
-            for weights in (self.loss.actor_network_params, critics)
-        )
+        actors = list(loss.actor_network_params.values(True, True))
+        critics = list(loss.value_network_params.values(True, True))
         decay = config.critic_weight_decay
         self.optimizer = group_optimizers(
             torch.optim.Adam(actors, lr=config.actor_lr, fused=True),
@@ -122,11 +118,6 @@ class DDPG(Learner):
             mixed=not (config.share_parameters and policy.agent_index),
         )
         self.learning_starts = self.replay.learning_starts
-
-    def _make_loss(self, critic: Callable[[], Any]) -> tuple[Any, Any]:
-        """Returns TorchRL's loss and its critics' weights, given what makes a critic."""
-        loss = DDPGLoss(self.actor, critic(), delay_actor=True, delay_value=True, reduction="none")
-        return loss, loss.value_network_params
 
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
         """Stores a rollout, and performs updates if there is a full batch."""

@@ -1,25 +1,30 @@
 """TD3 for all UAVs (Fujimoto, van Hoof and Meger 2018, ICML)."""
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import torch
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torchrl.objectives import TD3Loss
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
+from torchrl.objectives import SoftUpdate, TD3Loss, group_optimizers
 
 from emberlink.envs import keys
-from emberlink.policies.networks import TAKEN
+from emberlink.policies.exploration import OrnsteinUhlenbeck
+from emberlink.policies.networks import STATE_ACTION_VALUE, TAKEN, make_critic
 from emberlink.trainers.learners.base import (
     STRICT,
     Count,
+    Learner,
+    LearnerContext,
     Losses,
     NotNegative,
     mean_over_batch,
 )
-from emberlink.trainers.learners.ddpg import DDPG, DDPGConfig
+from emberlink.trainers.learners.ddpg import DDPGConfig
+from emberlink.trainers.learners.replay import DONE, TERMINATED, TeamReplay, to_batch, to_rows
 
 _TARGET_NOISE = (keys.AGENTS, "target_noise")
 """float32 [batch, uavs, 3], under "next": noise on the target actors' actions"""
@@ -37,30 +42,76 @@ class TD3Config(DDPGConfig):
     """maximum absolute value of the target noise; actions are in [-1, 1]"""
 
 
-class TD3(DDPG):
-    """Updates the actor and two critics of each UAV, with target smoothing and delayed actors.
-
-    Everything else is as in DDPG.
-    """
+class TD3(Learner):
+    """Updates the actor and two critics of each UAV, with target smoothing and delayed actors."""
 
     config_type = TD3Config
-    config: TD3Config
 
-    def _make_loss(self, critic: Callable[[], Any]) -> tuple[Any, Any]:
-        critics, bounds = [critic(), critic()], (-1.0, 1.0)
-        # A list of critics, or TorchRL draws weights itself.
+    def __init__(self, config: TD3Config, context: LearnerContext):
+        self.config, self.context = config, context
+        # Networks of all UAVs, stacked, with weights per UAV or shared.
+        specs, policy = (context.observation_spec, context.action_spec), context.policy
+        initial = torch.Generator().manual_seed(context.seed)
+        self.actor = self.make_actor(config, *specs, initial, policy)
+        shape: dict[str, Any] = {
+            "share_parameters": config.share_parameters,
+            "agent_index": policy.agent_index,
+            "team": config.critic == "team",
+        }
+        critics = [make_critic(*specs, config.hidden, **shape, generator=initial) for _ in range(2)]
+        # Exploration.
+        self.generator = torch.Generator(context.device).manual_seed(context.seed)
+        noise = OrnsteinUhlenbeck(config.exploration, context.num_uavs, self.generator)
+        modules: list[Any] = [self.actor, noise]
+        self.explorer = TensorDictSequential(*modules)
+        # Losses and target networks. A list of critics, or TorchRL draws weights itself.
+        bounds: Any = (-1.0, 1.0)
         loss = TD3Loss(
             SmoothedActor(self.actor, critics[0]),  # pyright: ignore[reportArgumentType]
             critics,
-            bounds=bounds,  # pyright: ignore[reportArgumentType]
+            bounds=bounds,
             policy_noise=0.0,  # TorchRL's noise is of the global generator; `update` draws it
             noise_clip=0.0,
             loss_function="l2",
             reduction="none",
             deactivate_vmap=True,
         )
-        loss.set_keys(action=keys.ACTION)
-        return loss, loss.qvalue_network_params
+        loss.set_keys(
+            action=keys.ACTION,
+            state_action_value=STATE_ACTION_VALUE,
+            reward=keys.REWARD,
+            done=DONE,
+            terminated=TERMINATED,
+        )
+        loss.make_value_estimator(gamma=config.gamma)
+        self.loss, self.targets = loss, SoftUpdate(loss, tau=config.tau)
+        # Optimizer.
+        actor_weights = list(loss.actor_network_params.values(True, True))
+        critic_weights = list(loss.qvalue_network_params.values(True, True))
+        decay = config.critic_weight_decay
+        self.optimizer = group_optimizers(
+            torch.optim.Adam(actor_weights, lr=config.actor_lr, fused=True),
+            torch.optim.Adam(critic_weights, lr=config.critic_lr, weight_decay=decay, fused=True),
+        )
+        # Replay buffer.
+        self.replay = TeamReplay(
+            context,
+            self.generator,
+            batch_size=config.batch_size,
+            buffer_size=config.buffer_size,
+            joint=config.critic == "team",
+            # A shared network learns from all UAVs anyway, and its input is the index of a column.
+            mixed=not (config.share_parameters and policy.agent_index),
+        )
+        self.learning_starts = self.replay.learning_starts
+
+    def learn(self, rollout: TensorDictBase) -> list[Losses]:
+        """Stores a rollout, and performs updates if there is a full batch."""
+        self.replay.extend(to_rows(rollout, self.context))
+        if not self.replay.ready:
+            return []
+        updates = range(self.config.updates_per_step)
+        return [self.update(to_batch(self.replay.sample())) for _ in updates]
 
     def update(self, batch: TensorDictBase) -> Losses:
         """Updates the critics, and with every `policy_delay`-th update actors and targets.
@@ -91,6 +142,11 @@ class TD3(DDPG):
         if actor:
             losses["actor"] = mean_over_batch(self.loss.actor_loss(batch)[0], alive)
         return losses
+
+    def start_from(self, weights: Mapping[str, Tensor]) -> None:
+        """Begins with the actors of another run, and target actors like them."""
+        self.copy_actor(weights)
+        self.targets = SoftUpdate(self.loss, tau=self.config.tau)
 
 
 class SmoothedActor(TensorDictModuleBase):
