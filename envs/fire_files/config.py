@@ -2,9 +2,9 @@
 
 import dataclasses
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.errors import UserError
@@ -19,12 +19,6 @@ _Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 _Text = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
-def _required(value: Any) -> Any:
-    if value is None:
-        raise UserError("a file is needed, such as fire.path=ArrivalTime.asc")
-    return value
-
-
 @dataclass(
     frozen=True,
     kw_only=True,
@@ -37,7 +31,7 @@ class FileFireConfig:
     """`file`, or `masks` for an array of states `[time, y, x]`, such as 0 unburnt, 1 and 2 fire."""
     name: Name = "file"
     """Name of the scenario and its file in configs/fire."""
-    path: Annotated[_Text, BeforeValidator(_required)]
+    path: _Text
     """The file, or a folder of one fire's perimeters; relative to the working directory."""
     test: _Text | None = None
     """A second file, of the test fires; without one every fifth fire of the file is a test fire."""

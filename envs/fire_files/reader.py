@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
 from emberlink.envs.fire_files.files import TABLES, digest, find_format, quiet
-from emberlink.envs.fire_files.grid import Fire, on_grid
+from emberlink.envs.fire_files.grid import on_grid
 from emberlink.envs.fire_files.perimeters import read_perimeters
 from emberlink.envs.fire_files.rasters import MAX_BANK, read_raster
 from emberlink.envs.fire_files.report import Report, ask
@@ -35,15 +35,22 @@ def read_with_summary(
     config: FileFireConfig, grid: tuple[int, int], horizon: int
 ) -> tuple[Tensor, str]:
     """Returns the fires of `read_fires` and the findings about the file; warns of a misreading."""
-    fires, report = [], Report()
+    report = Report()
     with _named(config.path, config.layer) as path, quiet():
-        sources = _sources(path, config, horizon, report)
-        for source in sources:
-            try:
-                fires.append(on_grid(source, config, grid, horizon, report))
-            except UserError as error:
-                place = f"fire {len(fires)}: " if len(sources) > 1 else ""
-                raise UserError(f"{place}{'; '.join([str(error), *report.doubts])}") from None
+        kind = find_format(path)
+        given = [key for key in _OF_TABLES if getattr(config, key) is not None]
+        if kind in TABLES and (config.kind == "masks" or config.unburned is not None):
+            raise ask("fire.kind=masks and fire.unburned are for rasters", "none")
+        if kind not in TABLES and given:
+            raise ask(f"fire.{given[0]} chooses among perimeters", "none for a raster")
+        if kind in TABLES:
+            sources = [read_perimeters(read_table(path, kind, config), config, report)]
+        else:
+            sources = read_raster(path, kind, config, horizon, report)
+        try:
+            fires = [on_grid(source, config, grid, horizon, report) for source in sources]
+        except UserError as error:
+            raise UserError("; ".join([str(error), *report.doubts])) from None
     cells = sorted({int(np.isfinite(fire).sum()) for fire in fires})
     burn = " to ".join(map(str, cells[:: max(1, len(cells) - 1)]))
     facts = [*report.facts, f"{burn} of {' x '.join(map(str, grid))} cells burn"]
@@ -65,19 +72,6 @@ def _named(file: str, layer: str | None = None) -> Iterator[Path]:
             text = f"cannot be read: {getattr(error, 'strerror', None) or 'not enough memory'}"
         place = f"{path}, layer {layer}" if layer else str(path)
         raise UserError(printable(f"{place}: {text}")) from None
-
-
-def _sources(path: Path, config: FileFireConfig, horizon: int, report: Report) -> Sequence[Fire]:
-    """Returns the fires in a file; only a bank has more than one."""
-    kind = find_format(path)
-    if kind in TABLES:
-        if config.kind == "masks" or config.unburned is not None:
-            raise ask("fire.kind=masks and fire.unburned are for rasters", "none")
-        return [read_perimeters(read_table(path, kind, config), config, report)]
-    for key in _OF_TABLES:
-        if getattr(config, key) is not None:
-            raise ask(f"fire.{key} chooses among perimeters", "none for a raster")
-    return read_raster(path, kind, config, horizon, report)
 
 
 class FireSets(NamedTuple):
