@@ -229,12 +229,13 @@ def parse_dates(texts: Sequence[str], form: str | None, key: str) -> list[dateti
     known = (*_ORDERS, *_SINCE_1970)
     if form is not None and form not in known and "%" not in form:
         raise ask(f"fire.time_format={form}", ", ".join(known), "such as %d.%m.%Y")
-    lengths = {len(text) if text.isdecimal() else 0 for text in texts}
+    distinct = [*dict.fromkeys(texts)]
+    lengths = {len(text) if text.isdecimal() else 0 for text in distinct}
     forms = _DIGITS.get(lengths.pop(), _ORDERS) if len(lengths) == 1 else _ORDERS
     fits, text = {}, ""
     for name in (form,) if form else forms:
         with contextlib.suppress(ValueError, OverflowError, OSError):
-            fits[name] = [_read((text := each).strip(), name) for each in texts]
+            fits[name] = [_read((text := each).strip(), name) for each in distinct]
     if form is None and forms is not _ORDERS:
         now = datetime.now(UTC) + timedelta(days=1)
         likely = {n for n, d in fits.items() if max(map(in_utc, d)) < now and d[0].year > 1980}
@@ -246,7 +247,8 @@ def parse_dates(texts: Sequence[str], form: str | None, key: str) -> list[dateti
         raise ask(
             f"{key}={texts[0][:40]!r} fits {listed}", *map("fire.time_format={}".format, fits)
         )
-    return next(iter(fits.values()))
+    read = dict(zip(distinct, next(iter(fits.values())), strict=True))
+    return [read[text] for text in texts]
 
 
 def is_date(text: str) -> bool:
