@@ -1,5 +1,6 @@
 """Compares consensus on random networks with an implementation in plain Python."""
 
+import math
 import random
 
 import pytest
@@ -111,3 +112,62 @@ def compare_streaks(scalar: ScalarConsensus, module: Consensus, env: int) -> Non
     for i, score in enumerate(module.fire_score[env].tolist()):
         assert score == scalar.fire_score(i)
         assert module.altitude_sum[env, i] == pytest.approx(scalar.altitude_sum(i), abs=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3])
+@pytest.mark.parametrize(
+    ("most", "agree", "best"),
+    [(10**6, True, True), (45, True, False), (20, False, True), (19, True, True)],
+)
+def test_late_records_equal_plain_python(delay, most, agree, best):
+    """Discoverers' records, passed on one link a step, in one environment of 8 UAVs."""
+    uavs, steps, generator = 8, 40, torch.Generator().manual_seed(delay)
+    radio = RadioConfig(range=9.0, loss=0.2, delay=delay, bandwidth=most)
+    config = ConsensusConfig(agree=agree, follow="best" if best else "nearest", wander=False)
+    world, talk, before = WildfireConfig(radio=radio), None, None
+    scalar = ScalarConsensus(9.0)
+    newest, received = [{} for _ in range(uavs)], [{} for _ in range(uavs)]
+    flying, followed = [], 0
+    position, sees = torch.rand(1, uavs, 3, generator=generator) * 25 + 1, None
+    for step in range(steps):
+        drawn = torch.rand(2, 1, uavs, generator=generator)
+        sees = drawn[0] < 0.3 if sees is None else torch.where(drawn[1] < 0.8, sees, drawn[0] < 0.3)
+        position = position + torch.rand(1, uavs, 3, generator=generator) - 0.5
+        now = time_step(position, (drawn[1] * 9).long() * sees, sees * 0, step=step)
+        now.set(keys.ALIVE, torch.ones(1, uavs, dtype=torch.bool))
+        if talk is None or before is None:
+            talk = communication(now, config, world)
+            now = talk._reset(now, now)
+        else:
+            now = talk._step(before, now)
+        before, hears = now, now[keys.HEARS][0].tolist()
+        places = [tuple(p) for p in now[keys.POSITION][0].tolist()]
+        new = now[keys.NEW_FIRE][0].tolist()
+        scalar.step(places, new, [0] * uavs)
+        for i in range(uavs):
+            says = dict(received[i]) if agree and not new[i] else {}
+            if new[i]:
+                says = {i: (step, places[i], scalar.rank(i))}
+            ranked = sorted(says, key=lambda j, says=says: -says[j][2])
+            said = {j: says[j] for j in ranked[: most // 20]}
+            assert talk.module.said[0, i] == 20 * len(said)
+            flying += [(step + delay, k, said) for k in range(uavs) if hears[k][i]]
+        received = [{} for _ in range(uavs)]
+        for _, hearer, said in (m for m in flying if m[0] == step):
+            for j, record in said.items():
+                newer = record[0] > newest[hearer].get(j, -1)
+                if j != hearer and newer and record[0] > received[hearer].get(j, (-1,))[0]:
+                    received[hearer][j] = record
+        flying = [m for m in flying if m[0] > step]
+        for i, records in enumerate(received):
+            newest[i] |= {j: record[0] for j, record in records.items()}
+
+            def worse(j, i=i, records=records, places=places):
+                return -records[j][2] if best else math.dist(places[i], records[j][1])
+
+            leader = i if new[i] else min(sorted(records), key=worse, default=-1)
+            assert now[keys.FOLLOWS][0, i] == leader
+            if leader not in (-1, i):
+                followed += 1
+                assert tuple(now[keys.TARGET][0, i].tolist()) == records[leader][1]
+    assert followed > 10 or most == 19
