@@ -5,7 +5,6 @@
     python docs/experiments/study.py run OUTPUT front      # only those of some worlds
 
 Each training is one process with one thread; one that was stopped is resumed.
-`study_tables.py` makes the tables.
 """
 
 import shlex

@@ -1,7 +1,7 @@
 """Writes the tables between markers on the pages from docs/data.
 
-    python docs/experiments/tables.py                        # make tables
-    python docs/experiments/tables.py pack NAME LABEL=RUNS…  # makes the files of a study
+    python docs/experiments/tables.py                          # make tables
+    python docs/experiments/tables.py pack NAME [LABEL=]RUNS…  # makes the files of a study
 
 `<!-- table: NAME -->` names a table of tables.yaml. A cell is an expression, its row in the place
 of `{}` in its column or the other way round: function, runs, measure and number of digits, such as
@@ -34,12 +34,22 @@ def written(text: str) -> str:
     return TABLE.sub(lambda found: f"{found[1]}{table(**known[found[2]])}{found[3]}", text)
 
 
-def table(columns: dict[str, str], rows: dict[str, Any], first: str = "") -> str:
-    """Returns a table; `first` is the head of the names of rows, and a list holds texts."""
+def table(
+    columns: dict[str, str], rows: dict[str, Any], first: str = "", holm: str | None = None
+) -> str:
+    """Returns a table; `first` is the head of the names of rows, and a list holds texts.
+
+    The p-values of the column `holm` are corrected; those without data are 1.
+    """
     lines = [[first, *columns], ["---"] * (len(columns) + first.count("|") + 1)]
     for name, row in rows.items():
         cells = row if isinstance(row, list) else [cell(row, c) for c in columns.values()]
         lines.append([name.rstrip(), *cells])
+    if holm:
+        place, tested = 1 + [*columns].index(holm), lines[2:]
+        corrected = bootstrap.holm([float(line[place] or 1) for line in tested])
+        for line, p in zip(tested, corrected, strict=True):
+            line[place] = line[place] and f"{p:.4f}"
     return "".join(f"| {' | '.join(line)} |\n".replace("|  |", "| |") for line in lines)
 
 
@@ -51,13 +61,17 @@ def cell(row: str, column: str) -> str:
     if not len(samples[0]):
         return ""
     value, ends = FUNCTIONS[function](samples, measure)
+    if np.isnan(value):
+        return "undetermined"
     texts = [f"{x:,.{digits}f}".replace("-", "\N{MINUS SIGN}") for x in (value, *(ends or ()))]
     return f"{texts[0]} [{texts[1]}, {texts[2]}]" if ends and ends[0] < ends[1] else texts[0]
 
 
 @cache
 def frame(name: str) -> dict[Any, Any]:
-    data = pd.read_csv(DATA / f"{name}.csv.xz").rename(columns={"episode": "fire"})
+    if not (file := DATA / f"{name}.csv.xz").exists():
+        return {}
+    data = pd.read_csv(file).rename(columns={"episode": "fire"})
     return dict(iter(data.fillna({"seed": -1}).groupby(["run", "measure"])))
 
 
@@ -91,6 +105,28 @@ def same(samples: Any, _: str) -> Any:
     return value, [*np.quantile(resampled, [0.025, 0.975])]
 
 
+def value(samples: Any, _: str) -> Any:
+    """Returns (arm - none) / (full - none) with its interval, NaN unless full - none is above 0."""
+
+    def share(none: Any, arm: Any, full: Any, axis: int = -1) -> Any:
+        gains = [bootstrap.iqm_difference(sample, none, axis) for sample in (arm, full)]
+        return gains[0] / gains[1]
+
+    none, _, full = samples
+    most = bootstrap.crossed_interval(bootstrap.iqm_difference, full, none)
+    if most is None or most[0] <= 0:
+        return np.nan, None
+    means = (sample.mean(1) for sample in samples)
+    return share(*means), bootstrap.crossed_interval(share, *samples)
+
+
+def rise(samples: Any, _: str) -> Any:
+    """Returns by how much the last eighth of a learning curve exceeds the one before."""
+    curve = samples[0].mean(0)
+    last = curve[-max(2, len(curve) // 4) :]
+    return last[len(last) // 2 :].mean() - last[: len(last) // 2].mean(), None
+
+
 def ratio(samples: Any, measure: str) -> Any:
     """Returns how many times better a method is than the best other one, with its interval."""
     share = partial(bootstrap.iqm_ratio_share, higher=measure in metrics.HIGHER_IS_BETTER)
@@ -102,16 +138,21 @@ def ratio(samples: Any, measure: str) -> Any:
 FUNCTIONS: dict[str, Any] = {
     **{"iqm": iqm, "gain": gain, "same": same, "ratio": ratio, "last10": partial(iqm, last=2)},
     **{f"run{i}": lambda samples, _, i=i: (iqm(samples, _, i)[0], None) for i in range(3)},
-    "seed0": partial(iqm, seeds=1),
+    **{"value": value, "rise": rise, "seed0": partial(iqm, seeds=1)},
+    "p": lambda samples, _: (bootstrap.crossed_p(bootstrap.iqm_difference, *samples), None),
     "seeds": lambda samples, _: (len(samples[0]), None),
 }
 
 
 def pack(name: str, *folders: str) -> None:
-    """Writes evaluations, learning curves and configurations of runs to docs/data."""
+    """Writes evaluations, learning curves and configurations of runs to docs/data.
+
+    The label of a folder without one is its name.
+    """
     rows: dict[Any, Any] = {}
     curves, configs = [], {}
-    for label, folder in (text.split("=", 1) for text in folders):
+    for label, _, folder in (text.rpartition("=") for text in folders):
+        label = label or Path(folder).name
         for file in sorted(Path(folder).rglob("eval*.json")):
             found = json.loads(file.read_text())
             changed = file.stem.removeprefix("eval").replace("_", "@", 1)

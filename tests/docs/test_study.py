@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from emberlink.trainers.config.compose import differences, resolve
 
 sys.path.append(str(Path(__file__).parents[2] / "docs" / "experiments"))
-study, study_tables = import_module("study"), import_module("study_tables")
+study, tables = import_module("study"), import_module("tables")
 EXCHANGED = ("method", "replay", "comm.", "policy.message", "env.radio.")
 
 
@@ -31,19 +32,30 @@ def test_arms_differ_in_what_uavs_exchange(world):
                 assert [key for key in apart if not key.startswith(EXCHANGED)] == [], name
 
 
-def test_planned_comparisons_are_of_arms():
-    for world, *labels in study_tables.PLANNED:
-        assert {*labels} <= {"_".join(arm) for arm in study.arms(world)}
-    names = {"_".join(arm) for arm in study.arms("front")}
-    assert {*study_tables.UNLIMITED} <= names
+def test_tables_are_of_arms():
+    known = yaml.safe_load((Path(tables.__file__).with_suffix(".yaml")).read_text())
+    for name in ("study", "study_value"):
+        for row in known[name]["rows"].values():
+            for run in row.split()[:-1]:
+                world, arm = run.removeprefix("study_").split("/")
+                assert arm in {"_".join(parts) for parts in study.arms(world)}
+    for world in study.WORLDS:
+        shown = {row.split("@")[0] for row in known[f"study_{world}"]["rows"].values()}
+        assert shown == {"_".join(parts) for parts in study.arms(world)}
 
 
-def test_the_value_of_communication_by_hand():
+def test_the_numbers_of_the_study_by_hand():
     """50, 60 and 75 on each fire, with little spread over the seeds."""
-    arms = [
-        np.full((5, 4), x) + np.array([[0.0], [0.1], [0.2], [0.3], [0.4]]) for x in (50, 60, 75)
-    ]
-    assert study_tables.value_of_communication(*arms).startswith("0.40 [0.3")
-    assert study_tables.value_of_communication(arms[0], arms[1], arms[0]) == "undetermined"
-    lines = [{"front/coverage": x} for x in (0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 10, 20, 30, 60)]
-    assert study_tables.rise_at_the_end(lines, "coverage") == 45 - 15
+    spread = np.array([[0.0], [0.1], [0.2], [0.3], [0.4]])
+    none, some, full = (np.full((5, 4), x) + spread for x in (50, 60, 75))
+    value, ends = tables.value([none, some, full], "")
+    assert value == pytest.approx(0.4)
+    assert 0.3 < ends[0] < 0.4 < ends[1] < 0.5
+    assert np.isnan(tables.value([none, some, none], "")[0])
+    assert tables.rise([np.array([[0] * 12 + [10, 20, 30, 60]])], "")[0] == 45 - 15
+
+
+def test_p_values_are_corrected_for_all_comparisons():
+    rows = {"a": ["1.0", "0.01"], "b": ["", ""], "c": ["2.0", "0.02"]}
+    lines = tables.table({"gain": "", "p": ""}, rows, holm="p").splitlines()
+    assert [line.split("|")[3].strip() for line in lines[2:]] == ["0.0300", "", "0.0400"]
