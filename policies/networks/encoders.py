@@ -17,23 +17,6 @@ MAX_SIDE = 15
 """cells along a side of a window; a larger window is average-pooled before the convolutions"""
 
 
-class VectorEncoder(nn.Module):
-    """Returns a vector unchanged.
-
-    Args:
-        groups: not used.
-        shape: [features].
-    """
-
-    def __init__(self, groups: int, shape: Sequence[int], **_: Any):
-        super().__init__()
-        (self.features,) = shape
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Maps float32 [groups, rows, features] to itself."""
-        return x
-
-
 class WindowEncoder(nn.Module):
     """Applies two 3 x 3 convolutions, the second with stride 2, each followed by a ReLU.
 
@@ -43,12 +26,7 @@ class WindowEncoder(nn.Module):
         start: see `layers.Start`.
     """
 
-    def __init__(
-        self,
-        groups: int,
-        shape: Sequence[int],
-        **start: Any,
-    ):
+    def __init__(self, groups: int, shape: Sequence[int], **start: Any):
         super().__init__()
         channels, *sides = shape
         self.pool = -(-max(sides) // MAX_SIDE)
@@ -78,12 +56,7 @@ class PictureEncoder(nn.Module):
         start: see `layers.Start`.
     """
 
-    def __init__(
-        self,
-        groups: int,
-        shape: Sequence[int],
-        **start: Any,
-    ):
+    def __init__(self, groups: int, shape: Sequence[int], **start: Any):
         super().__init__()
         pictures, channels, *sides = shape
         self.pictures = nn.ModuleList()
@@ -111,12 +84,8 @@ class PictureEncoder(nn.Module):
         return torch.cat(encoded, -1)
 
 
-ENCODERS = {1: VectorEncoder, 3: WindowEncoder, 4: PictureEncoder}
-"""the encoder for each number of dimensions of a tensor, per UAV"""
-
-
 class ObservationEncoder(nn.Module):
-    """Encodes each tensor of an observation and concatenates the features.
+    """Encodes windows and pictures of an observation and joins them to its vectors.
 
     Args:
         groups: number of groups of weights.
@@ -128,18 +97,16 @@ class ObservationEncoder(nn.Module):
         ValueError: there is no encoder for the shape of a tensor.
     """
 
-    def __init__(
-        self,
-        groups: int,
-        shapes: Sequence[Sequence[int]],
-        **start: Any,
-    ):
+    def __init__(self, groups: int, shapes: Sequence[Sequence[int]], **start: Any):
         super().__init__()
+        self.parts, self.features = nn.ModuleList(), 0
+        kinds: dict[int, Any] = {1: nn.Identity, 3: WindowEncoder, 4: PictureEncoder}
         for shape in shapes:
-            if len(shape) not in ENCODERS:
+            if len(shape) not in kinds:
                 raise ValueError(f"no encoder for an observation of shape {list(shape)} per UAV")
-        self.parts = nn.ModuleList(ENCODERS[len(shape)](groups, shape, **start) for shape in shapes)
-        self.features: int = sum(part.features for part in self.parts)  # pyright: ignore[reportArgumentType, reportCallIssue]
+            part = kinds[len(shape)](groups, shape, **start)
+            self.parts.append(part)
+            self.features += shape[0] if len(shape) == 1 else part.features
 
     def forward(self, tensors: Sequence[Tensor]) -> Tensor:
         """Maps tensors [groups, rows, *shape] to float32 [groups, rows, features]."""

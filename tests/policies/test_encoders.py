@@ -7,8 +7,7 @@ from torch import nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from emberlink.envs import keys
-from emberlink.policies.networks import make_actor
-from emberlink.policies.networks.actor_critic import StackedActor
+from emberlink.policies.networks.actor_critic import StackedActor, make_actor
 from emberlink.policies.networks.encoders import (
     PictureEncoder,
 )

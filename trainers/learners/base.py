@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 import torch
 from pydantic import Field, Strict
 from pydantic.dataclasses import dataclass
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Composite
@@ -18,14 +18,16 @@ from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.utils.validation import STRICT, Name
-from emberlink.policies.networks import make_actor
+from emberlink.policies.networks.actor_critic import make_actor
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.learners.tensors import (
     copy_into,
+    flatten,
     group,
     load_optimizer,
     optimizer_tensors,
     prefixed,
+    unflatten,
 )
 
 Positive = Annotated[float, Field(gt=0, le=1e30)]
@@ -103,8 +105,9 @@ class Learner(ABC):
 
     A learner owns the networks, their updates, the transitions that it learns from, and the
     exploration policy. A subclass sets `actor`, `loss` and `optimizer`, a `generator` if it draws
-    random numbers after `__init__`, and `replay` if it has a replay buffer; these are saved. Other
-    state is added by the subclass's `state_dict` and `load_state_dict`.
+    random numbers after `__init__`, `replay` if it has a replay buffer, and `recent` if it learns
+    from whole sequences; these are saved. Other state is added by the subclass's `state_dict` and
+    `load_state_dict`.
     """
 
     config_type: ClassVar[type[LearnerConfig]]
@@ -125,6 +128,10 @@ class Learner(ABC):
     """decisions of the batch of environments per call of `learn`; must divide the horizon"""
     learning_starts: int = 0
     """decisions of the batch of environments before the first update"""
+    recent: Any = ()
+    """time steps that no update has used yet, batch size [environments, steps] each"""
+    decisions: int = 0
+    """decisions of the batch of environments so far, if the learner counts them"""
     updates: int = 0
     """updates made so far"""
 
@@ -188,12 +195,15 @@ class Learner(ABC):
         """Returns the state that learning changes, by name."""
         generator = {} if self.generator is None else {"state": self.generator.get_state()}
         replay = {} if self.replay is None else self.replay.state_dict()
+        recent: Any = torch.cat(self.recent, 1) if self.recent else TensorDict({})  # pyright: ignore[reportArgumentType, reportCallIssue]
+        counters = {"updates": self.updates, "decisions": self.decisions}
         return prefixed(
             replay=replay,
             weights=self.weights(),
             networks=self._other_networks(),
             optimizer=optimizer_tensors(self.optimizer),
-            counters={"updates": torch.tensor(self.updates)},
+            counters={name: torch.tensor(count) for name, count in counters.items()},
+            recent=flatten(recent),
             generator=generator,
         )
 
@@ -207,6 +217,10 @@ class Learner(ABC):
         copy_into(self._other_networks(), group(state, "networks"))
         load_optimizer(self.optimizer, group(state, "optimizer"))
         self.updates = int(state["counters/updates"])
+        self.decisions = int(state["counters/decisions"])
+        if recent := group(state, "recent"):
+            device = next(iter(self.weights().values())).device
+            self.recent = list(unflatten(recent, 2, device).split(1, 1))
         if self.generator is not None:
             self.generator.set_state(state["generator/state"].cpu())
         if self.replay is not None:

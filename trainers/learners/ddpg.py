@@ -14,7 +14,7 @@ from torchrl.objectives import DDPGLoss, SoftUpdate, group_optimizers
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.exploration import ExplorationConfig, OrnsteinUhlenbeck
-from emberlink.policies.networks import STATE_ACTION_VALUE, TAKEN, make_critic
+from emberlink.policies.networks.actor_critic import STATE_ACTION_VALUE, TAKEN, make_critic
 from emberlink.trainers.learners.base import (
     STRICT,
     Count,

@@ -9,13 +9,11 @@ from pydantic.dataclasses import dataclass
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.data import Composite
 
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name
 from emberlink.policies.gaussian import MEMORY, GaussianActor
-from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.learners.base import (
     LEARNERS,
     STRICT,
@@ -28,7 +26,6 @@ from emberlink.trainers.learners.base import (
     mean_over_batch,
 )
 from emberlink.trainers.learners.replay import TeamReplay
-from emberlink.trainers.learners.tensors import flatten, group, prefixed, unflatten
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -104,21 +101,11 @@ class Imitation(Learner):
         )
         self.learning_starts = self.replay.learning_starts
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.lr, fused=True)
-        self.decisions = 0
-        """decisions so far, in the whole run"""
-        self._recent: list[TensorDictBase] = []
-        """decisions that do not fill a row yet, batch size [environments, 1] each"""
+        self.recent = []  # decisions that do not fill a row yet
         self._schedule()
 
     @classmethod
-    def make_actor(
-        cls,
-        config: Any,
-        observation_spec: Composite,
-        action_spec: Composite,
-        generator: torch.Generator | None = None,
-        policy: PolicyConfig | None = None,
-    ) -> Any:
+    def make_actor(cls, config: Any, *given: Any, **more: Any) -> Any:
         """Returns new actors of the learner `actor_of`."""
         learner = LEARNERS.find(config.actor_of, "learner.actor_of")
         if issubclass(learner, cls):
@@ -126,7 +113,7 @@ class Imitation(Learner):
             raise UserError(
                 f"learner.actor_of={config.actor_of}: has no actors of its own; known: {others}"
             )
-        return learner.make_actor(config, observation_spec, action_spec, generator, policy)
+        return learner.make_actor(config, *given, **more)
 
     def _schedule(self) -> None:
         """Lowers the teacher's share and the learning rate linearly."""
@@ -149,23 +136,23 @@ class Imitation(Learner):
         kept += [keys.ALIVE] if self.context.failures else []
         kept += [MEMORY] if self.remembers else []
         for decision in rollout.select(*kept).split(1, 1):
-            self._recent.append(decision.clone())
+            self.recent.append(decision)
             self.decisions += 1
-            missing = self.sequence - len(self._recent)
+            missing = self.sequence - len(self.recent)
             if missing and self.decisions % self.context.horizon:
                 continue
-            parts: Any = [*self._recent, *[decision] * missing]
+            parts: Any = [*self.recent, *[decision] * missing]
             whole: Any = torch.cat(parts, 1)
             agents = whole.get(keys.AGENTS)
             alive = agents.get("alive", torch.ones(agents.shape, dtype=torch.bool)).clone()
-            alive[:, len(self._recent) :] = False
+            alive[:, len(self.recent) :] = False
             rows = {name: value.transpose(1, 2) for name, value in agents.items()}
             if self.remembers:
                 rows["memory"] = rows["memory"][:, :, 0]
             rows["alive"] = alive.transpose(1, 2).to(agents.device)
             size = rollout.shape[0], self.context.num_uavs
             self.replay.extend(TensorDict(rows, size, device=rollout.device))
-            self._recent = []
+            self.recent = []
 
     def update(self, batch: TensorDictBase) -> Losses:
         """Performs one step of the optimizer on rows of the replay buffer, [batch, uavs]."""
@@ -190,18 +177,8 @@ class Imitation(Learner):
         loss = nn.functional.smooth_l1_loss(action, teacher, reduction="none").mean(-1)
         return {"imitation": mean_over_batch(loss, batch.get("alive").transpose(1, 2))}
 
-    def state_dict(self) -> dict[str, Tensor]:
-        recent: Any = torch.cat(self._recent, 1) if self._recent else TensorDict({})  # pyright: ignore[reportArgumentType]
-        return super().state_dict() | prefixed(
-            recent=flatten(recent) | {"decisions": torch.tensor(self.decisions)},
-        )
-
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         super().load_state_dict(state)
-        recent = group(state, "recent")
-        self.decisions = int(recent.pop("decisions"))
-        whole: Any = unflatten(recent, 2, self.context.device) if recent else None
-        self._recent = [] if whole is None else [part.clone() for part in whole.split(1, 1)]
         self._schedule()
 
 

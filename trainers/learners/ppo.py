@@ -39,7 +39,6 @@ from emberlink.trainers.learners.base import (
     Positive,
     mean_over_batch,
 )
-from emberlink.trainers.learners.tensors import copy_into, flatten, group, prefixed, unflatten
 
 VALUE = (keys.AGENTS, "state_value")
 """float32 [..., 1]: the critics' output, in units of the returns' standard deviation"""
@@ -141,9 +140,11 @@ class PPO(Learner, ABC):
             done=_ENDS,
             terminated=_TERMINATED,
         )
-        self.spread = torch.zeros(self._networks_of_actors, device=context.device)
+        networks = 1 if config.share_parameters else context.num_uavs
+        self.spread = torch.zeros(networks, device=context.device)
         """standard deviation of the returns of each network's UAVs, averaged over iterations; the
         unit of the critics' values; 0 before the first iteration"""
+        self.loss.register_buffer("spread", self.spread)  # saved with it
         # Optimizer.
         self.parts = [list(part.module.parameters()) for part in (self.actor, self.critic)]
         weights = [*self.parts[0], *self.parts[1]]
@@ -151,10 +152,7 @@ class PPO(Learner, ABC):
         self.learning_starts = context.horizon
         # Several decisions at once cost less; those of an episode would fill the memory twice.
         self.rollout_steps = max(n for n in range(1, 11) if context.horizon % n == 0)
-        self.decisions = 0
-        """decisions so far, in the whole run"""
-        self._episode: list[TensorDictBase] = []
-        """transitions of the current episode, batch size [environments, steps] each"""
+        self.recent = []  # transitions of the current episode
 
     @classmethod
     def make_actor(
@@ -218,18 +216,14 @@ class PPO(Learner, ABC):
         )
         return loss
 
-    @property
-    def _networks_of_actors(self) -> int:
-        return 1 if self.config.share_parameters else self.context.num_uavs
-
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
         """Stores a rollout, and makes all updates of an iteration at the end of an episode."""
-        self._episode.append(self._transitions(rollout))
+        self.recent.append(self._transitions(rollout))
         self.decisions += rollout.shape[1]
         if self.decisions % self.context.horizon:
             return []
-        episode: Any = torch.cat(self._episode, 1)  # pyright: ignore[reportArgumentType]
-        self._episode = []
+        episode: Any = torch.cat(self.recent, 1)  # pyright: ignore[reportArgumentType]
+        self.recent = []
         states = self._estimate(episode, rollout.get("next")[:, -1:])
         chunks = self._chunks(episode, states)
         done = (self.decisions - self.context.horizon) / self.context.total_steps
@@ -381,18 +375,6 @@ class PPO(Learner, ABC):
         """Resets the standard deviation of the actions to `log_std`."""
         with torch.no_grad():
             self.actor.module.log_std.fill_(self.config.log_std)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        episode: Any = torch.cat(self._episode, 1) if self._episode else TensorDict({})  # pyright: ignore[reportArgumentType]
-        returns = {"spread": self.spread, "decisions": torch.tensor(self.decisions)}
-        return super().state_dict() | prefixed(returns=returns, episode=flatten(episode))
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        super().load_state_dict(state)
-        copy_into({"spread": self.spread}, {"spread": state["returns/spread"]})
-        self.decisions = int(state["returns/decisions"])
-        episode = group(state, "episode")
-        self._episode = [unflatten(episode, 2, self.context.device)] if episode else []
 
 
 class IPPO(PPO):

@@ -136,30 +136,15 @@ def to_rows(rollout: TensorDictBase, context: LearnerContext) -> TensorDict:
         rollout: batch size [environments, steps].
         context: context of the learner; "alive", from the end of each step, is kept if UAVs fail.
     """
-    observed, uavs = keys.observation_keys(context.observation_spec), context.num_uavs
-
-    def rows(key: Any) -> Tensor:
-        return rollout.get(key).flatten(0, 1)
-
-    def per_uav(key: str) -> Tensor:
-        return rows(("next", key)).unsqueeze(1).expand(-1, uavs, -1)
-
-    alive = {"alive": rows(("next", *keys.ALIVE))} if context.failures else {}
-    return TensorDict(
-        {
-            **{key[-1]: rows(key) for key in observed},
-            **alive,
-            "action": rows(keys.ACTION),
-            "next": {
-                **{key[-1]: rows(("next", *key)) for key in observed},
-                "reward": rows(("next", *keys.REWARD)),
-                "done": per_uav("done"),
-                "terminated": per_uav("terminated"),
-            },
-        },
-        batch_size=(rollout.numel(), uavs),
-        device=rollout.device,
-    )
+    observed = [name for _, name in keys.observation_keys(context.observation_spec)]
+    now, after = rollout.get(keys.AGENTS), rollout.get(("next", keys.AGENTS))
+    rows = now.select(*observed, "action")
+    following = after.select(*observed, "reward")
+    for key in ("done", "terminated"):
+        following.set(key, rollout.get(("next", key)).unsqueeze(2).expand(*now.shape, 1))
+    if context.failures:
+        rows.set("alive", after.get("alive"))
+    return rows.set("next", following).flatten(0, 1)
 
 
 def to_batch(sample: TensorDictBase) -> TensorDict:

@@ -13,7 +13,7 @@ from torchrl.objectives import SoftUpdate, TD3Loss, group_optimizers
 
 from emberlink.envs import keys
 from emberlink.policies.exploration import OrnsteinUhlenbeck
-from emberlink.policies.networks import STATE_ACTION_VALUE, TAKEN, make_critic
+from emberlink.policies.networks.actor_critic import STATE_ACTION_VALUE, TAKEN, make_critic
 from emberlink.trainers.learners.base import (
     STRICT,
     Count,

@@ -11,10 +11,7 @@ from emberlink.envs import keys
 
 def flatten(tree: TensorDictBase) -> dict[str, Tensor]:
     """Returns the leaves of a TensorDict by name; nested keys are joined by dots."""
-    return {
-        key if isinstance(key, str) else ".".join(key): value
-        for key, value in tree.items(include_nested=True, leaves_only=True)
-    }
+    return dict(tree.flatten_keys(".").items())
 
 
 def unflatten(tensors: Mapping[str, Tensor], dims: int, device: torch.device | str) -> TensorDict:

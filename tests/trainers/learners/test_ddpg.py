@@ -174,10 +174,10 @@ def test_which_uavs_transitions_a_shared_network_learns_from(own):
     learner = make_learner(share_parameters=True, index=own, shared_replay=True)
     rows = torch.arange(float(UAVS)).view(1, 1, UAVS, 1)
     flags = torch.zeros(1, 30, 1, dtype=torch.bool)
-    agents = {"observation": rows.expand(1, 30, UAVS, FEATURES)}
-    after = {**agents, "reward": rows.expand(1, 30, UAVS, 1)}
+    agents = TensorDict({"observation": rows.expand(1, 30, UAVS, FEATURES)}, [1, 30, UAVS])
+    after = agents.copy().set("reward", rows.expand(1, 30, UAVS, 1))
     following = {keys.AGENTS: after, "done": flags, "terminated": flags.clone()}
-    agents = {**agents, "action": rows.expand(1, 30, UAVS, ACTIONS)}
+    agents.set("action", rows.expand(1, 30, UAVS, ACTIONS))
     learner.replay.extend(
         to_rows(TensorDict({keys.AGENTS: agents, "next": following}, [1, 30]), learner.context)
     )
