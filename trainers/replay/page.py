@@ -89,7 +89,7 @@ def encode(shown: Sequence[Episode], fire: str) -> bytes:
 
 def _panel(shown: Episode) -> dict[str, Any]:
     """Returns the data of an episode; `steps` has a row for each number, with all its steps."""
-    world, steps = shown.recording.world, dict(shown.recording.steps)
+    world, steps = shown.recording.world, shown.recording.steps | shown.recording.ages()
     fails = [int(step) for step in steps.pop("alive").sum(0)]
     if not steps["lost"].any():
         del steps["lost"]

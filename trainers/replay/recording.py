@@ -1,6 +1,7 @@
 """Records an episode, so that it can be drawn: fire, tracks, fields of view, links, measures."""
 
 import dataclasses
+import math
 from functools import cached_property
 from typing import Any
 
@@ -13,13 +14,11 @@ from torch import Tensor
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.envs.world.coverage_map import View
-from emberlink.envs.world.measures import Measures, whole_steps
+from emberlink.envs.world.measures import age_limits, whole_steps
 from emberlink.envs.world.radio import Channel
 from emberlink.envs.world.sensor import Sensor
 
 COUNTS = {"seen": keys.SEEN, "burning": keys.BURNING, "burnt": keys.BURNT}
-AGES = {"front_age": keys.FRONT_AGE, "front_age_p95": keys.FRONT_AGE_P95}
 OF_BASE = {"base_seen": keys.BASE_SEEN, "base_age": keys.BASE_AGE}
 ADVICE = {"follows": keys.FOLLOWS, "target": keys.TARGET}
 """advice of a communication module to the UAVs"""
@@ -47,7 +46,7 @@ class Recording:
       whether it was in range but the message was lost
     - missed: bool [n, W, W], the cells of the view, from its first along x and y, that the UAV did
       not recognise; only with `env.sensor`
-    - `COUNTS` and `AGES`, `OF_BASE` with a base, `ADVICE` if the policy follows it
+    - `COUNTS`, `OF_BASE` with a base, `ADVICE` if the policy follows it
     """
 
     @property
@@ -60,14 +59,36 @@ class Recording:
         """The first step at which a UAV saw each cell while it burned, T + 1 for never, [X, Y]."""
         first = np.full_like(self.ignition, self.horizon + 1)
         for step in range(self.horizon, 0, -1):
-            for uav, (left, right, low, high) in enumerate(self.steps["view"][step].tolist()):
-                seen = np.s_[left : right + 1, low : high + 1]
-                burns = (self.ignition[seen] <= step) & (step < self.end[seen])
-                if "missed" in self.steps:
-                    missed = self.steps["missed"][step, uav]
-                    burns &= ~missed[: burns.shape[0], : burns.shape[1]]
-                first[seen][burns] = step
+            first[self._seen(step)] = step
         return first
+
+    def ages(self) -> dict[str, NDArray[Any]]:
+        """Returns the measures `front_age` and `front_age_p95` up to each step, float32 [T + 1]."""
+        since, counts = self.ignition.copy(), np.zeros(self.horizon + 1, int)
+        every, limits = np.arange(self.horizon + 1), age_limits(self.horizon).numpy()
+        ages = np.zeros((2, self.horizon + 1), np.float32)
+        for step in range(1, self.horizon + 1):
+            since[self._seen(step)] = step
+            counts += np.bincount(step - since[self._burns(step)], minlength=len(counts))
+            rank = math.ceil(counts.sum() * 0.95)
+            highest = (counts.cumsum() < rank).sum()
+            ages[0, step] = counts @ every / max(counts.sum(), 1)
+            ages[1, step] = limits[np.searchsorted(limits, highest, "right") - 1]
+        return dict(zip(("front_age", "front_age_p95"), ages, strict=True))
+
+    def _burns(self, step: int) -> NDArray[np.bool_]:
+        return (self.ignition <= step) & (step < self.end)
+
+    def _seen(self, step: int) -> NDArray[np.bool_]:
+        """Returns the burning cells that a UAV recognised at a step, bool [X, Y]."""
+        seen = np.zeros(self.ignition.shape, bool)
+        for uav, (left, right, low, high) in enumerate(self.steps["view"][step].tolist()):
+            part = seen[left : right + 1, low : high + 1]
+            if "missed" in self.steps:
+                part |= ~self.steps["missed"][step, uav, : part.shape[0], : part.shape[1]]
+            else:
+                part[:] = True
+        return seen & self._burns(step)
 
     def fire_map(self, step: int) -> NDArray[np.uint8]:
         """Returns `WildfireEnv.fire_map` at a step, uint8 [X, Y]."""
@@ -98,9 +119,9 @@ class Episode:
 class Recorder:
     """Records the episode of one environment; `add` is called at each step.
 
-    It repeats what the environment computes and does not show: views, links and, in every world,
-    the ages. `member` is the index of the environment; `advised` tells whether the policy reads
-    what the communication tells it, and `hears` whether it receives messages of its own.
+    It repeats what the environment computes and does not show: views and links. `member` is the
+    index of the environment; `advised` tells whether the policy reads what the communication tells
+    it, and `hears` whether it receives messages of its own.
     """
 
     def __init__(self, *, member: int = 0, advised: bool = True, hears: bool = False):
@@ -112,22 +133,22 @@ class Recorder:
         now: Any = td[self._member : self._member + 1].cpu()
         if not self._steps:
             self._start(world)
-        wanted = {"position": keys.POSITION, "alive": keys.ALIVE, **COUNTS}
-        values = {name: now.get(key) for name, key in wanted.items()}
-        reward = now.get(keys.REWARD, None)
-        values["reward"] = torch.zeros(values["alive"].shape) if reward is None else reward[..., 0]
+        wanted = {"position": keys.POSITION, "alive": keys.ALIVE, **COUNTS, **OF_BASE}
         if self._advised:
             self._hears |= now.get(keys.HEARS, None) is not None
-            advice = {name: now.get(key, None) for name, key in ADVICE.items()}
-            values |= {name: value for name, value in advice.items() if value is not None}
+            wanted |= ADVICE
+        values = {name: now.get(key, None) for name, key in wanted.items()}
+        reward = now.get(keys.REWARD, None)
+        values["reward"] = torch.zeros(values["alive"].shape) if reward is None else reward[..., 0]
         for name, value in (values | self._look(now)).items():
-            self._steps.setdefault(name, []).append(value[0].numpy().copy())
+            if value is not None:
+                self._steps.setdefault(name, []).append(value[0].numpy().copy())
 
     def recording(self) -> Recording:
         """Returns the recorded episode."""
-        ignition, end = (self._sensor.crop(steps)[0].numpy() for steps in self._whole)
         steps = {name: np.stack(values) for name, values in self._steps.items()}
         listens = self._hears or self._config.base is not None
+        ignition, end = (times.numpy() for times in self._whole)
         return Recording(
             world=self._config, listens=listens, ignition=ignition, end=end, steps=steps
         )
@@ -135,73 +156,44 @@ class Recorder:
     def _start(self, world: WildfireEnv) -> None:
         """Takes the fire of the environment."""
         self._config, self._sensor = world.config, Sensor.of(world.config)
-        measured = dataclasses.replace(world.config, measures="all")
-        self._measures = Measures(measured, 1, self._sensor.area)
-        member, burn_out = [self._member], world.burn_out
-        arrival = self._sensor.pad(world.arrival_time[member].cpu(), torch.nan)
-        end = None if burn_out is None else self._sensor.pad(burn_out[member].cpu(), torch.nan)
-        self._times, never = (arrival, end), torch.full_like(arrival, torch.inf)
-        self._whole = [
-            whole_steps(times, world.config.horizon)
-            for times in (arrival, never if end is None else end)
-        ]
-        counts = self._burning(torch.zeros(1)).sum(-1), (self._whole[0] == 0).sum(-1)
-        self._measures.start_episodes(torch.ones(1, dtype=torch.bool), arrival, *counts)
+        arrival, burn_out = world.arrival_time[self._member].cpu(), world.burn_out
+        end = torch.full_like(arrival, torch.inf) if burn_out is None else burn_out[self._member]
+        self._whole = [whole_steps(times.cpu(), world.config.horizon) for times in (arrival, end)]
         self._channel = Channel(world.config, 1, base=world.config.base is not None)
 
     def _look(self, now: TensorDictBase) -> dict[str, Tensor]:
-        """Returns the views, links and ages of a time step of batch size [1]."""
+        """Returns the views and links of a time step of batch size [1]."""
         position, alive = now.get(keys.POSITION).double(), now.get(keys.ALIVE)
         key, step = now.get(keys.RNG_KEY), now.get(keys.STEP)
-        start = torch.zeros(1, 1, dtype=torch.int64)
-        whole = self._sensor.look(position, start)[2] & alive.unsqueeze(-1)
-        view = self._view(position, alive, key, step)
-        if step > 0:  # nobody looks at the reset
-            ignition, end = self._whole
-            burnt, (row, cell) = (ignition <= step).sum(-1), (end == step).nonzero().unbind(1)
-            seen = View(*(part.unsqueeze(0) for part in view))
-            at = position[None], key, step[None], alive[None], burnt[None]
-            self._measures.update(seen, (row, cell), self._times, *at)
-        else:
-            whole.zero_()
         hears = self._channel(position, key, step, alive)
         near = self._channel.in_range(position, alive)
-        measured = self._measures.values(step)
-        ages = {name: measured[key] for name, key in (AGES | OF_BASE).items() if key in measured}
-        bounds = self._bounds(view._replace(in_view=whole))
-        looks = {"view": bounds}
+        looks = alive & (step > 0)  # nobody looks at the reset
+        view = self._view(position, looks)
+        found = {"view": view, "hears": hears, "lost": near & ~hears}
         if self._config.sensor != (1.0, 1.0):
-            looks["missed"] = self._missed(view._replace(in_view=whole & ~view.in_view), bounds)
-        return {**looks, "hears": hears, "lost": near & ~hears, **ages}
+            found["missed"] = self._missed(position, looks, key, step, view)
+        return found
 
-    def _view(self, position: Tensor, alive: Tensor, key: Tensor, step: Tensor) -> View:
-        start = torch.zeros(1, 1, dtype=torch.int64)
-        _, cells, in_view = self._sensor.look(position, start, key, step)
-        in_view &= alive.unsqueeze(-1)
-        return View(cells, in_view, in_view & self._burning(step)[0].take(cells))
-
-    def _burning(self, step: Tensor) -> Tensor:
-        ignition, end = self._whole
-        return (ignition <= step) & (step < end)
-
-    def _on_map(self, view: View) -> Tensor:
-        """Returns the cells in view on the map, bool [n, X, Y]."""
-        seen = torch.zeros(view.cells.shape[1], self._sensor.area, dtype=torch.bool)
-        return self._sensor.crop(seen.scatter_(1, view.cells[0], view.in_view[0]))
-
-    def _missed(self, missed: View, bounds: Tensor) -> Tensor:
-        """Returns missed cells from the corner of each view on, bool [1, n, W, W]."""
-        side = self._sensor.side
-        on_map = torch.nn.functional.pad(self._on_map(missed), (0, side, 0, side))
-        corners = zip(on_map, bounds[0, :, ::2].tolist(), strict=True)
-        return torch.stack([m[x : x + side, y : y + side] for m, (x, y) in corners]).unsqueeze(0)
-
-    def _bounds(self, view: View) -> Tensor:
+    def _view(self, position: Tensor, looks: Tensor) -> Tensor:
         """Returns the first and last cells in view along x and y, int16 [1, n, 4]."""
-        inside = self._on_map(view)
-        bounds = []
-        for axis in (2, 1):
-            line = inside.any(axis).int()
-            bounds += [line.argmax(-1), line.shape[-1] - 1 - line.flip(-1).argmax(-1)]
-        found, none = torch.stack(bounds, -1), torch.tensor([1, 0, 1, 0])
-        return torch.where(inside.any(2).any(1)[:, None], found, none).short().unsqueeze(0)
+        reach = position[..., 2:] * math.tan(math.radians(self._config.view_angle))
+        bounds, found = [], looks
+        for axis, side in enumerate(self._config.grid):
+            near = (torch.arange(side) - position[..., axis, None]).abs() <= reach
+            found = found & near.any(-1)
+            last = side - 1 - near.flip(-1).int().argmax(-1)
+            bounds += [near.int().argmax(-1), last]
+        none = torch.tensor([1, 0, 1, 0])
+        return torch.where(found[..., None], torch.stack(bounds, -1), none).short()
+
+    def _missed(
+        self, position: Tensor, looks: Tensor, key: Tensor, step: Tensor, view: Tensor
+    ) -> Tensor:
+        """Returns the cells in view that were not recognised, bool [1, n, W, W]."""
+        side, start = self._sensor.side, torch.zeros(1, 1, dtype=torch.int64)
+        centre, _, whole = self._sensor.look(position, start)
+        missed = whole & ~self._sensor.look(position, start, key, step)[2] & looks[..., None]
+        # From the first cell of the window to the first of the view, which is within the grid.
+        shifts = centre.long() - side // 2 - view[..., ::2]
+        windows = zip(missed[0].unflatten(-1, (side, side)), shifts[0].tolist(), strict=True)
+        return torch.stack([window.roll(shift, (0, 1)) for window, shift in windows])[None]
