@@ -70,6 +70,11 @@ class Scripted(TensorDictModuleBase):
         way = target - tensordict.get(keys.POSITION)
         return tensordict.set(keys.ACTION, motion.towards(way, self.stride))
 
+    def fly_over(self, tensordict: TensorDictBase, place: torch.Tensor) -> TensorDictBase:
+        """Writes the action that flies to the `search_altitude` above places, [num_envs, n, 2]."""
+        ceiling = self.high[2:].to(place.dtype).expand_as(place[..., :1])
+        return self.fly(tensordict, torch.cat((place, ceiling), -1))
+
     def carried(self, tensordict: TensorDictBase, key: str, initial: torch.Tensor) -> torch.Tensor:
         """Returns the tensor under `key`; `initial`, [num_envs, ...], where an episode begins."""
         previous = tensordict.get(key, None)

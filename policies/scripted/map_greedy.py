@@ -11,30 +11,19 @@ from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import radio
 from emberlink.envs.world.knowledge import step_type
-from emberlink.policies.scripted.base import Scripted
-from emberlink.policies.scripted.planning import (
-    HERE,
-    REPORT,
-    Rally,
-    Targets,
-    band,
-    next_report,
-    plan_period,
-)
+from emberlink.policies.scripted.planning import REPORT, Rally, Searcher, band, next_report
 from emberlink.policies.scripted.team_maps import TARGET_BYTES, Messages, TeamMaps
 
-_FLOWN = 2.0  # cells flown between two plans
 _NEAR = 2  # cells; within this distance of known fire a cell may have ignited
 _SPREAD = 50.0  # steps; time scale at which the chance of ignition near known fire grows
 _FAR = 0.04  # chance of fire in a cell never seen, far from known fire
 _AGAIN = 0.02  # chance of fire in a cell seen without fire long ago
 _FORGET = 300.0  # steps; time scale of "long ago"
 _AROUND = 6  # cells; within this distance, cells seen without fire make fire less likely
-_CLAIM = 2.0  # cells; half the side of the square that a UAV claims
 _EXACT = 2.0**16  # weights are multiples of its inverse, so that sums do not depend on their order
 
 
-class MapGreedy(Scripted):
+class MapGreedy(Searcher):
     """Flies to the cell with the highest chance of seeing new fire per distance.
 
     Each UAV has a map of the last step at which it knows each cell to have been seen: by itself, or
@@ -60,7 +49,9 @@ class MapGreedy(Scripted):
     messages: ClassVar[Messages] = "in range"
     informs_base: ClassVar[bool] = False
     """whether it brings sightings to a base"""
-    TARGET = "_map_greedy_target"
+    TARGET: ClassVar[str] = "_map_greedy_target"
+    flown: ClassVar[float] = 2.0
+    claim: ClassVar[float] = 2.0
 
     _near_x: Tensor
     _near_y: Tensor
@@ -70,11 +61,7 @@ class MapGreedy(Scripted):
 
     def __init__(self, env: WildfireEnv, maps: Any = None):
         super().__init__(env)
-        self.in_keys.append(keys.ALIVE)
-        self.out_keys.append(self.TARGET)
         self.maps = TeamMaps(env, self.messages).to(env.device) if maps is None else maps
-        self.targets = Targets(env, claim=_CLAIM)
-        self.period = plan_period(_FLOWN, self.world.displacement)
         for name, reach in (("near", _NEAR), ("around", _AROUND)):
             for axis, side in zip("xy", self.world.grid, strict=True):
                 self.register_buffer(f"_{name}_{axis}", band(side, reach).to(env.device))
@@ -90,24 +77,19 @@ class MapGreedy(Scripted):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self.maps.update(tensordict)
-        position = tensordict.get(keys.POSITION)
-        target = self.carried(tensordict, self.TARGET, position[..., :2])
-        due = tensordict.get(keys.STEP) % self.period == 0
-        if due.any():
-            target = torch.where(due.view(-1, 1, 1), self._plan(tensordict), target)
-        tensordict.set(self.TARGET, target)
-        ceiling = self.high[2:].float().expand_as(target[..., :1])
-        return self.fly(tensordict, torch.cat((target, ceiling), -1))
+        return super().forward(tensordict)
 
-    def _plan(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns a new target of each UAV, float32 [num_envs, n, 2], cells."""
-        ground = tensordict.get(keys.POSITION)[..., :2]
+    def plan(self, tensordict: TensorDictBase) -> Tensor:
+        step, ground = tensordict.get(keys.STEP), tensordict.get(keys.POSITION)[..., :2]
         last_seen = self.maps.last_seen()
         ignited, burnt_out = self.maps.was_fire(last_seen)
         burning = ignited & ~burnt_out
-        weight = self._weight(tensordict.get(keys.STEP), last_seen, ignited, burning)
-        distance = self.targets.distance(ground)
-        return self._choose(tensordict.get(keys.STEP), ground, burning, weight, distance)
+        weight = self._weight(step, last_seen, ignited, burning)
+        hears = self.maps.reach[:, : self.world.num_uavs, : self.world.num_uavs]
+        return self.search(step, ground, weight, hears, self._rally(step, burning))
+
+    def _rally(self, step: Tensor, burning: Tensor) -> Rally | None:
+        """Returns where each UAV has to be, given the fire and the UAVs it knows."""
 
     def _weight(self, step: Tensor, last_seen: Tensor, ignited: Tensor, burning: Tensor) -> Tensor:
         """Returns the chance that a look at a cell shows new fire, float32 [num_envs, n, X, Y]."""
@@ -120,17 +102,6 @@ class MapGreedy(Scripted):
         close = torch.where(never, 1.0, 1 - (-age / _SPREAD).exp())
         weight = torch.where(near, close, far).masked_fill_(ignited, 0.0)
         return weight.mul_(_EXACT).round_().div_(_EXACT)
-
-    def _choose(
-        self, step: Tensor, ground: Tensor, burning: Tensor, weight: Tensor, distance: Tensor
-    ) -> Tensor:
-        """Returns targets; `step` and `burning` are for subclasses."""
-        return self.targets.choose(ground, weight, distance + HERE, self._hears(ground))[0]
-
-    def _hears(self, ground: Tensor) -> Tensor:
-        """Returns whose targets each UAV knows, bool [num_envs, n, n]."""
-        uavs = ground.shape[1]
-        return self.maps.reach[:, :uavs, :uavs]
 
 
 class MapGreedyAlone(MapGreedy):
@@ -164,31 +135,9 @@ class Courier(MapGreedy):
     every: ClassVar[int | None] = None
     """steps from one chain to the next; None for one at the end of the episode"""
 
-    _base: Tensor
-
-    def __init__(self, env: WildfireEnv, maps: Any = None):
-        super().__init__(env, maps)
-        world, device = self.world, env.device
-        self.register_buffer("_base", torch.tensor(world.base or (0.0, 0.0), device=device))
-
-    def _choose(
-        self, step: Tensor, ground: Tensor, burning: Tensor, weight: Tensor, distance: Tensor
-    ) -> Tensor:
-        cost, hears = distance + HERE, self._hears(ground)
+    def _rally(self, step: Tensor, burning: Tensor) -> Rally | None:
         if self.world.base is None:
-            return self.targets.choose(ground, weight, cost, hears)[0]
-        speed = self.world.displacement
-        rally = self._rally(step, burning)
-        cells = self.targets.columns, self.targets.rows
-        late = rally.too_late(cells, step.view(-1, 1, 1, 1) + distance / speed, speed)
-        target, value = self.targets.choose(
-            ground, weight, cost.masked_fill_(late, math.inf), hears
-        )
-        leaves = rally.leaves(ground, step, speed, self.period) & (value <= 0)
-        return torch.where(leaves.unsqueeze(-1), rally.place, target)
-
-    def _rally(self, step: Tensor, burning: Tensor) -> Rally:
-        """Returns where each UAV has to be at the end, given the fire and the UAVs it knows."""
+            return None
         heard = self.maps.heard
         place, reach = radio.chain_to_fire(self.world, self._base, burning, step, heard)
         horizon = self.world.horizon

@@ -5,86 +5,78 @@ from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import radio
 from emberlink.envs.world.sensor import Sensor
-from emberlink.policies.scripted.base import Scripted
-from emberlink.policies.scripted.planning import (
-    HERE,
-    REPORT,
-    Rally,
-    Targets,
-    next_report,
-    plan_period,
-)
+from emberlink.policies.scripted.planning import REPORT, Rally, Searcher, next_report
 
 _STEP_COST = 1000.0  # cells; above any distance on a map, so that burning cells come first
-_FLOWN = 1.0  # cells flown between two plans
-_CLAIM = 3.0  # cells; half the side of the square that a UAV claims
 _WAIT = 10.0  # steps; time scale at which the weight of a cell falls that ignites after the arrival
 _LATE = 100.0  # steps before the end; the chain leads to the cells that burn in this time
 _MEET = 0.9  # of the radio's range; distance at which a UAV that will fail meets another one
 
 
-class Foresight(nn.Module):
-    """Chooses targets for UAVs, given the fire, and when each UAV fails.
+class Oracle(Searcher):
+    """Flies to the nearest uncovered cells, given the whole fire and the cells seen so far.
 
-    The value of a target is the number of cells in view from it that nobody has seen burn and that
-    burn when the UAV arrives, divided by its distance plus 2 cells. The UAV with the highest value
-    chooses first and claims 7 x 7 cells. With a base, a cell counts if neither a flying UAV nor the
-    base has a sighting of it while it burned. At the end of the episode the UAVs form a chain to
-    the base (`radio.chain`), each place held by the nearest UAV. Before it fails, a UAV flies to
-    the nearest UAV that will not fail.
+    At every step each UAV is assigned a cell that no UAV has seen. The cost of a cell is its
+    Chebyshev distance from the UAV plus 1000 cells for each step until it burns. So burning cells
+    come first, then the cells that burn soonest. The UAV with the lowest cost chooses first and
+    reserves all cells in view from its cell at that altitude, so that UAVs spread out. Ties
+    go to the lower index of UAVs and of cells. A UAV without a cell stays at its position, and one
+    that has failed gets none. All UAVs fly at the `search_altitude`.
+
+    Where cells burn out, or with a base, it foresees more. The value of a target is then the number
+    of cells in view from it that nobody has seen burn and that burn when the UAV arrives, divided
+    by its distance plus 2 cells. The UAV with the highest value chooses first and claims 7 x 7
+    cells. With a base, a cell counts if neither a flying UAV nor the base has a sighting of it
+    while it burned. At the end of the episode the UAVs form a chain to the base (`radio.chain`),
+    each place held by the nearest UAV. Before it fails, a UAV flies to the nearest UAV that will
+    not fail.
 
     Args:
-        env: the environment; its fire and failures are read.
-        every: steps from one chain to the next; None for one at the end of the episode.
+        env: the environment that it acts in; its fire and failures are read at every step.
     """
 
-    _base: Tensor
-    _never: Tensor
+    every: ClassVar[int | None] = None
+    """steps from one chain to the base to the next; None for one at the end of the episode"""
+    TARGET: ClassVar[str] = "_oracle_target"
+    flown: ClassVar[float] = 1.0
+    claim: ClassVar[float] = 3.0
 
-    def __init__(self, env: WildfireEnv, every: int | None = None):
-        super().__init__()
-        self._env, self._world, self._every = (env,), env.config, every
-        self.period = plan_period(_FLOWN, env.config.displacement)
-        self._targets = Targets(env, claim=_CLAIM)
-        self._sensor = Sensor.of(env.config)
-        self.register_buffer("_base", torch.tensor(env.config.base or (0.0, 0.0)))
-        self.register_buffer("_never", torch.tensor(math.inf))
-        self.to(env.device)
+    def __init__(self, env: WildfireEnv):
+        super().__init__(env)
+        self._env = (env,)  # in a tuple, so that it is not registered as a submodule
+        self._sensor = Sensor.of(self.world)
+        self.foresees = env.burn_out is not None or self.world.base is not None
+        self.period = self.period if self.foresees else 1
 
     def plan(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns a new target of each UAV, float32 [num_envs, n, 2], cells."""
-        ground, step = tensordict.get(keys.POSITION)[..., :2], tensordict.get(keys.STEP)
-        alive, speed = tensordict.get(keys.ALIVE), self._world.displacement
-        distance = self._targets.distance(ground)
-        arrives = step.view(-1, 1, 1, 1) + distance / speed
-        weight = self._weight(arrives, alive)
-        cost, hears = distance + HERE, alive.unsqueeze(-1) & alive.unsqueeze(-2)
-        if self._world.base is None:
-            return self._targets.choose(ground, weight, cost, hears)[0]
-        rally = self._rally(ground, step)
-        late = rally.too_late((self._targets.columns, self._targets.rows), arrives, speed)
-        cost.masked_fill_(late, math.inf)
-        target, value = self._targets.choose(ground, weight, cost, hears)
-        leaves = rally.leaves(ground, step, speed, self.period) & (value <= 0)
-        return torch.where(leaves.unsqueeze(-1), rally.place, target)
+        return self._foreseen(tensordict) if self.foresees else self._nearest_cells(tensordict)
 
-    def _times(self) -> tuple[Tensor, Tensor]:
-        """Returns arrival and burn-out times, float32 [num_envs, 1, X, Y] or a scalar inf."""
+    def _foreseen(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns the targets with the most cells in view per distance, [num_envs, n, 2]."""
+        ground, step = tensordict.get(keys.POSITION)[..., :2], tensordict.get(keys.STEP)
+        alive, speed = tensordict.get(keys.ALIVE), self.world.displacement
+        arrives = step.view(-1, 1, 1, 1) + self.distance(ground) / speed
+        weight, hears = self._weight(arrives, alive), alive.unsqueeze(-1) & alive.unsqueeze(-2)
+        rally = None if self.world.base is None else self._rally(ground, step)
+        return self.search(step, ground, weight, hears, rally).double()
+
+    def _times(self) -> tuple[Tensor, Tensor | float]:
+        """Returns arrival and burn-out times, float32 [num_envs, 1, X, Y]; or inf."""
         (env,) = self._env
-        end = self._never if env.burn_out is None else env.burn_out.unsqueeze(1)
+        end = math.inf if env.burn_out is None else env.burn_out.unsqueeze(1)
         return env.arrival_time.unsqueeze(1), end
 
     def _weight(self, arrives: Tensor, alive: Tensor) -> Tensor:
         """Returns the value of seeing each cell on arrival, float32 [num_envs, n, X, Y]."""
         ignition, end = self._times()
         meets = torch.maximum(arrives, ignition)
-        useful = self._unseen(alive).unsqueeze(1) & (meets < end) & (meets <= self._world.horizon)
+        useful = self._unseen(alive).unsqueeze(1) & (meets < end) & (meets <= self.world.horizon)
         useful &= alive[..., None, None]
         wait = (meets - arrives).masked_fill_(~useful, 0.0)
         return useful * (-wait / _WAIT).exp()
@@ -101,7 +93,7 @@ class Foresight(nn.Module):
     def _rally(self, ground: Tensor, now: Tensor) -> Rally:
         """Returns where each UAV has to be at the next report, or before it fails."""
         (env,) = self._env
-        horizon, uavs = self._world.horizon, ground.shape[1]
+        horizon, uavs = self.world.horizon, ground.shape[1]
         fails = torch.full_like(ground[..., 0], horizon + 1)
         fails = fails if env.fail_step is None else env.fail_step.float()
         lasting = fails > horizon
@@ -111,78 +103,27 @@ class Foresight(nn.Module):
         meets = ~lasting & nearest.isfinite()
         friend = ground.gather(1, other.unsqueeze(-1).expand(-1, uavs, 2))
         place = torch.where(meets.unsqueeze(-1), friend, place)
-        reach = torch.where(meets, _MEET * self._world.radio.range, reach)
-        due = next_report(now, self._every or horizon, horizon)
+        reach = torch.where(meets, _MEET * self.world.radio.range, reach)
+        due = next_report(now, self.every or horizon, horizon)
         step = torch.where(lasting, due, torch.where(meets, fails - 1, math.inf))
         return Rally(place, reach, step)
 
     def _chain(self, ground: Tensor, lasting: Tensor) -> tuple[Tensor, Tensor]:
         """Returns the place and reach of each UAV in a chain of the UAVs that do not fail."""
         ignition, end = self._times()
-        late = (ignition <= self._world.horizon) & (end > self._world.horizon - _LATE)
+        late = (ignition <= self.world.horizon) & (end > self.world.horizon - _LATE)
         envs, uavs = lasting.shape
         centre, count = radio.middle(late), lasting.sum(-1, keepdim=True)
         rank = torch.full_like(lasting, uavs, dtype=torch.int64)
         env = torch.arange(envs, device=ground.device)
         for link in range(uavs):
             here = torch.full_like(count, link)
-            place, _ = radio.chain(self._world, self._base, centre, here, count)
+            place, _ = radio.chain(self.world, self._base, centre, here, count)
             apart = torch.linalg.vector_norm(ground - place, dim=-1)
             apart.masked_fill_(~lasting | (rank < uavs), math.inf)
             nearest, uav = apart.min(-1)
             rank[env, uav] = torch.where(nearest.isfinite(), link, rank[env, uav])
-        return radio.chain(self._world, self._base, centre, rank, count)
-
-
-class Oracle(Scripted):
-    """Flies to the nearest uncovered cells, given the whole fire and the cells seen so far.
-
-    At every step each UAV is assigned a cell that no UAV has seen. The cost of a cell is its
-    Chebyshev distance from the UAV plus 1000 cells for each step until it burns. So burning cells
-    come first, then the cells that burn soonest. The UAV with the lowest cost chooses first and
-    reserves all cells in view from its cell at that altitude, so that UAVs spread out. Ties
-    go to the lower index of UAVs and of cells. A UAV without a cell stays at its position, and one
-    that has failed gets none. All UAVs fly at the `search_altitude`.
-
-    Where cells burn out, or with a base, `Foresight` chooses the targets.
-
-    Args:
-        env: the environment that it acts in; its fire is read at every step.
-    """
-
-    every: ClassVar[int | None] = None
-    """steps from one chain to the base to the next; None for one at the end of the episode"""
-    TARGET = "_oracle_target"
-    columns: Tensor
-    rows: Tensor
-
-    def __init__(self, env: WildfireEnv):
-        super().__init__(env)
-        self._env = (env,)  # in a tuple, so that it is not registered as a submodule
-        foresees = env.burn_out is not None or self.world.base is not None
-        self._foresight = Foresight(env, self.every) if foresees else None
-        self.in_keys.append(keys.ALIVE)
-        if foresees:
-            self.out_keys.append(self.TARGET)
-        self.register_buffer("columns", torch.arange(self.world.grid[0]).double().to(env.device))
-        self.register_buffer("rows", torch.arange(self.world.grid[1]).double().to(env.device))
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._foresight is None:
-            target = self._nearest_cells(tensordict)
-        else:
-            target = self._foreseen(tensordict, self._foresight)
-        ceiling = self.high[2:].expand_as(target[..., :1])
-        return self.fly(tensordict, torch.cat((target, ceiling), -1))
-
-    def _foreseen(self, tensordict: TensorDictBase, foresight: Foresight) -> Tensor:
-        """Returns the targets of `Foresight`, float32 [num_envs, n, 2]."""
-        target = self.carried(tensordict, self.TARGET, tensordict.get(keys.POSITION)[..., :2])
-        due = tensordict.get(keys.STEP) % foresight.period == 0
-        if due.any():
-            target = torch.where(due.view(-1, 1, 1), foresight.plan(tensordict), target)
-        tensordict.set(self.TARGET, target)
-        return target
+        return radio.chain(self.world, self._base, centre, rank, count)
 
     def _nearest_cells(self, tensordict: TensorDictBase) -> Tensor:
         """Returns the cell that is assigned to each UAV, float64 [num_envs, n, 2]."""
@@ -210,9 +151,7 @@ class Oracle(Scripted):
 
     def _nearest(self, delay: Tensor, ground: Tensor) -> tuple[Tensor, Tensor]:
         """Returns one UAV's lowest cost, [num_envs], and its cell, [num_envs, 2], float64."""
-        along_x = (ground[:, :1] - self.columns).abs().unsqueeze(-1)
-        along_y = (ground[:, 1:] - self.rows).abs().unsqueeze(-2)
-        distance, index = (torch.maximum(along_x, along_y) + delay).flatten(1).min(-1)
+        distance, index = (self.distance(ground) + delay).flatten(1).min(-1)
         side = len(self.rows)
         return distance, torch.stack((index // side, index % side), -1).double()
 

@@ -1,13 +1,17 @@
 """Plans the flights of scripted policies: target cells, and places to meet in time."""
 
-from typing import NamedTuple
+import math
+from abc import ABC, abstractmethod
+from typing import ClassVar, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from tensordict import TensorDictBase
+from torch import Tensor
 
+from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world.radio import PASSING
-from emberlink.envs.world.sensor import search_altitude, view_radius
+from emberlink.policies.scripted.base import Scripted
 
 REPORT = 250
 """steps from one report to a base to the next, for policies that report all the time"""
@@ -15,30 +19,69 @@ HERE = 2.0
 """cells added to distances, so that no cell is at distance 0"""
 
 
-class Targets(nn.Module):
-    """Chooses the cell above which each UAV sees the highest sum of weights per cost.
+class Searcher(Scripted, ABC):
+    """Flies to the cells above which UAVs see the highest sum of weights per cost.
 
-    Args:
-        env: the environment; its grid and the view from the `search_altitude` are used.
-        claim: cells within this distance of a UAV's target, along x and y, have no weight for
-            other UAVs that know of the target.
+    UAVs choose anew whenever they can have flown some cells (every 10 steps at most). The targets
+    are carried in the TensorDict.
     """
+
+    TARGET: ClassVar[str]
+    """key of the targets, float [num_envs, n, 2], cells"""
+    flown: ClassVar[float]
+    """cells flown between two plans"""
+    claim: ClassVar[float]
+    """cells within this distance of a UAV's target, along x and y, have no weight for other UAVs
+    that know of the target"""
 
     columns: Tensor
     rows: Tensor
     _view_x: Tensor
     _view_y: Tensor
+    _base: Tensor
 
-    def __init__(self, env: WildfireEnv, *, claim: float):
-        super().__init__()
-        world = env.config
-        self._claim = claim
-        radius = view_radius(search_altitude(world), world.view_angle)
-        for name, side in zip(("columns", "rows"), world.grid, strict=True):
+    def __init__(self, env: WildfireEnv):
+        super().__init__(env)
+        self.in_keys.append(keys.ALIVE)
+        self.out_keys.append(self.TARGET)
+        self.period = min(10, max(1, round(self.flown / self.world.displacement)))
+        for name, side in zip(("columns", "rows"), self.world.grid, strict=True):
             self.register_buffer(name, torch.arange(side).float(), persistent=False)
-        for name, side in zip(("_view_x", "_view_y"), world.grid, strict=True):
-            self.register_buffer(name, band(side, radius), persistent=False)
+        for name, side in zip(("_view_x", "_view_y"), self.world.grid, strict=True):
+            self.register_buffer(name, band(side, self.radius), persistent=False)
+        self.register_buffer("_base", torch.tensor(self.world.base or (0.0, 0.0)))
         self.to(env.device)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        target = self.carried(tensordict, self.TARGET, tensordict.get(keys.POSITION)[..., :2])
+        due = tensordict.get(keys.STEP) % self.period == 0
+        if due.any():
+            target = torch.where(due.view(-1, 1, 1), self.plan(tensordict), target)
+        return self.fly_over(tensordict.set(self.TARGET, target), target)
+
+    @abstractmethod
+    def plan(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns a new target of each UAV, float [num_envs, n, 2], cells."""
+
+    def search(
+        self, step: Tensor, ground: Tensor, weight: Tensor, hears: Tensor, rally: "Rally | None"
+    ) -> Tensor:
+        """Returns targets from which UAVs come to where they have to be in time.
+
+        Args:
+            step: int64 [envs], steps since the episode began.
+            ground, weight, hears: see `choose`.
+            rally: where the UAVs have to be; None if nowhere.
+        """
+        distance = self.distance(ground)
+        cost, speed = distance + HERE, self.world.displacement
+        if rally is None:
+            return self.choose(ground, weight, cost, hears)[0]
+        arrives = step.view(-1, 1, 1, 1) + distance / speed
+        cost.masked_fill_(rally.too_late((self.columns, self.rows), arrives, speed), math.inf)
+        target, value = self.choose(ground, weight, cost, hears)
+        leaves = rally.leaves(ground, step, speed, self.period) & (value <= 0)
+        return torch.where(leaves.unsqueeze(-1), rally.place, target)
 
     def distance(self, ground: Tensor) -> Tensor:
         """Returns Chebyshev distances, float [..., X, Y], of all cells from points [..., 2]."""
@@ -81,8 +124,8 @@ class Targets(nn.Module):
             found = (best > 0).unsqueeze(-1)
             cell = torch.where(found, cell, ground[env, turn])
             target[env, turn], worth[env, turn] = cell, best
-            near_x = (cell[:, :1] - self.columns).abs() <= self._claim
-            near_y = (cell[:, 1:] - self.rows).abs() <= self._claim
+            near_x = (cell[:, :1] - self.columns).abs() <= self.claim
+            near_y = (cell[:, 1:] - self.rows).abs() <= self.claim
             taken_x[env, turn] = (near_x & found).float()
             taken_y[env, turn] = near_y.float()
         return target, worth
@@ -101,11 +144,6 @@ def next_report(step: Tensor, every: int, horizon: int) -> Tensor:
         step: int64 [envs], steps since the episode began.
     """
     return ((step // every + 1) * every).clamp(max=horizon).unsqueeze(-1).float()
-
-
-def plan_period(flown: float, displacement: float) -> int:
-    """Returns the steps in which a UAV flies `flown` cells, from 1 to 10."""
-    return min(10, max(1, round(flown / displacement)))
 
 
 class Rally(NamedTuple):
