@@ -132,6 +132,9 @@ class Exchange(nn.Module):
         size = self.sizes[entry % self.shape[2]]
         sent = spent.view(-1).index_add(0, entry // self.shape[2], size).view_as(spent)
         if self.free:
+            # What all in range heard need not be said again.
+            missed = (self.contact & ~hears.mT).any(-1).view(-1)
+            self.pending.view(-1)[entry] = missed[entry // self.shape[2]]
             return sent, hears, self._listen(known, entry, code, hears)
         now = hears & (sent > 0).unsqueeze(1)
         if self.config.delay:
@@ -247,7 +250,13 @@ class Exchange(nn.Module):
         env, speaker = row // radios, row % radios
         target = (env * radios + hearer) * items + cell
         changed = newer(code, codes(known, target))
-        self.pending.view(-1)[target[changed]] = True
+        told_again = changed
+        if self.free:
+            # Nor need it be passed on to those in range of a hearer who have all heard it, too.
+            missed = ~arrives & ~torch.eye(radios, dtype=torch.bool, device=arrives.device)
+            relays = (self.contact.float() @ missed.float()) > 0  # [envs, hearers, speakers]
+            told_again = changed & relays.view(-1)[target // items * radios + speaker]
+        self.pending.view(-1)[target[told_again]] = True
         last, seen = known.last_seen, known.seen_fire
         assert seen is not None
         last.view(-1).scatter_reduce_(0, target, (code >> 1).to(last.dtype), "amax")
