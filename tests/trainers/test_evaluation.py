@@ -172,8 +172,9 @@ def test_narrow_tables_keep_every_number(columns, monkeypatch, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= int(columns)
     words = " ".join(lines).split()
-    for number, _ in measured.values():
-        assert words.count(str(number)) == 1 + len(POLICIES)
+    for name, (number, _) in measured.items():
+        shown = f"{number:.{scores.DIGITS.get(name, 1)}f}"
+        assert words.count(shown) == 1 + len(POLICIES)
 
 
 def test_validation_has_fires_and_starts_of_its_own(cache, monkeypatch):

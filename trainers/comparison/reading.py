@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as checked
 
@@ -18,7 +17,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import describe, shown
 from emberlink.trainers.config.values import flat
 from emberlink.trainers.evaluation.foreign import foreign_name
-from emberlink.trainers.evaluation.scores import CURVES, LEARNED
+from emberlink.trainers.evaluation.scores import LEARNED
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.compact_json import infinite
 from emberlink.trainers.runs.run_folder import MAX_JSON, RunFolder, read_text
@@ -139,7 +138,9 @@ def read(path: Path) -> Run:
     settings = {"world": "paper", "edition": 1, **flat(folder.values())}
     _check_types(settings, path / "config.yaml")
     name = foreign_name(folder)
-    lines = [] if name else _curves(folder, settings["episodes"])
+    lines, episodes = ([], 0) if name else (folder.metrics(), settings["episodes"])
+    if len(lines) < episodes:
+        raise UserError(f"unfinished: {len(lines)} of {episodes} episodes")
     again = f"emberlink eval {shlex.quote(str(path))}"
     if not (path / "eval.json").exists():
         raise UserError(f"not evaluated: there is no eval.json ({again})")
@@ -151,7 +152,7 @@ def read(path: Path) -> Run:
         raise UserError(
             f"eval.json is of step {tested}, the newest checkpoint of {trained} ({again})"
         )
-    return Run(path, name or settings["method"], settings, lines, evaluation)
+    return Run(path, name or settings["method"], settings, lines[:episodes], evaluation)
 
 
 def _check_types(settings: Mapping[str, Any], file: Path) -> None:
@@ -175,18 +176,6 @@ def read_evaluation(file: Path) -> Evaluation:
             if any(len(values) != evaluation.fires for values in measured.values()):
                 raise UserError(f"{file}: {policy} on {fire}: not {evaluation.fires} episodes")
     return evaluation
-
-
-def _curves(folder: RunFolder, episodes: int) -> list[dict[str, Any]]:
-    """Returns the lines of metrics.jsonl, one per episode of a finished training."""
-    lines = folder.metrics()[:episodes]
-    if len(lines) < episodes:
-        raise UserError(f"unfinished: {len(lines)} of {episodes} episodes")
-    for number, line in enumerate(lines, 1):
-        values = [line.get(name, np.nan) for name in CURVES]
-        if line["episode"] != number or not np.isfinite(np.array(values, float)).all():
-            raise UserError(f"{folder.path / 'metrics.jsonl'}: line {number}: not of an episode")
-    return lines
 
 
 def evaluated_otherwise(run: Run, file: Path) -> list[Run]:

@@ -25,12 +25,10 @@ from emberlink.trainers.comparison.bootstrap import FEW
 from emberlink.trainers.comparison.comparison import Comparison, about
 from emberlink.trainers.comparison.rankings import differing, trained_on
 from emberlink.trainers.comparison.tables import Frame
-from emberlink.trainers.evaluation.scores import CURVES, LEARNED
+from emberlink.trainers.evaluation.scores import CURVES, DIGITS, LEARNED
 from emberlink.trainers.terminal.console import plain_table
 
 NONE = "-"
-DIGITS = {"mean_reward": 3, "boundary_exits": 2, "fire_losses": 2}
-"""digits after the decimal point; 1 for other measures"""
 ENDS = "95 % interval"
 BETTER = "P(better than the next)"
 NUMBERS = {

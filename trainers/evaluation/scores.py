@@ -21,6 +21,9 @@ CURVES = {
 }
 """measure -> axis label, in the order of the paper's figures 5 to 9"""
 
+DIGITS = {"mean_reward": 3, "boundary_exits": 2, "fire_losses": 2}
+"""digits after the decimal point in tables; 1 for other measures"""
+
 LEARNED = "learned"
 """name of the learned policy in results"""
 
@@ -87,12 +90,6 @@ def means_table(
     for name in measures:  # one word per line, so that the table fits 80 columns
         table.add_column(name.replace("_", "\n"), justify="right")
     for policy, mean in rows:
-        numbers = [_number(name, mean[name]) for name in measures]
+        numbers = [f"{mean[name]:.{DIGITS.get(name, 1)}f}" for name in measures]
         table.add_row(policy, *numbers, style="bold" if policy == bold else None)
     return table
-
-
-def _number(measure: str, value: float) -> str:
-    """Formats a value with one decimal place, but a mean reward with at least four digits."""
-    digits = max(1, 4 - len(str(int(abs(value))))) if measure == "mean_reward" else 1
-    return f"{value:.{digits}f}"
