@@ -27,11 +27,7 @@ def cache_folder() -> Path:
 
 
 def bank_key(
-    config: GeneratedConfig,
-    split: Split,
-    count: int,
-    grid: tuple[int, int],
-    horizon: int,
+    config: GeneratedConfig, split: Split, count: int, grid: tuple[int, int], horizon: int
 ) -> str:
     """Returns a hash of all values on which a bank of fires depends."""
     ranges = dataclasses.asdict(config)
@@ -41,11 +37,7 @@ def bank_key(
 
 
 def fire_bank(
-    config: GeneratedConfig,
-    split: Split,
-    count: int,
-    grid: tuple[int, int],
-    horizon: int,
+    config: GeneratedConfig, split: Split, count: int, grid: tuple[int, int], horizon: int
 ) -> Tensor:
     """Returns the first `count` fires of a split, computed once and then read from a file.
 

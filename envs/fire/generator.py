@@ -8,10 +8,9 @@ Lengths of a scenario are in cells. With `lengths: scaled`, they are for a grid 
 has 30 cells (`BASE_SIDE`); on another grid lengths and rates are scaled by min(X, Y)/30.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import torch
 from pydantic import Field, ValidationError
@@ -24,18 +23,16 @@ from emberlink.envs.fire.ranges import (
     TEST_FROM,
     VALIDATION_FROM,
     Degrees,
+    FireRanges,
     Fraction,
     Length,
     Ordered,
     Pair,
-    TestSeed,
-    Turn,
-    unit_draws,
 )
 from emberlink.envs.fire.reaction import ReactionConfig, reaction_fires
 from emberlink.envs.utils.config_files import find, known, read
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import STRICT, Name, describe
+from emberlink.envs.utils.validation import STRICT, describe
 
 Split = Literal["train", "validation", "test"]
 
@@ -54,29 +51,19 @@ _Count = Annotated[int, Field(ge=0, le=32)]
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class FireConfig:
+class FireConfig(FireRanges):
     """A distribution of fires: each pair (low, high) is the range of a uniform draw."""
 
-    name: Name
-    """Name of the scenario and its file."""
-    num_train_fires: Annotated[int, Field(ge=1, lt=TEST_FROM)]
-    """Number of fires to train on."""
+    drawn: ClassVar[tuple[str, ...]] = (
+        *("head_ros", "length_to_breadth", "azimuth", "wind_shift"),
+        *("centre_x", "centre_y", "core_radius", "ring_width"),
+        *("fuel_patches", "patch_bearing", "patch_distance", "patch_radius", "patch_rate"),
+        *("drift_rate", "tide_reach", "tide_period", "tide_phase", "tide_bearing"),
+    )
     head_ros: Annotated[tuple[_Rate, _Rate], Pair, Ordered]
     """Rate of spread of the head, cells per step."""
     length_to_breadth: Annotated[tuple[_Ratio, _Ratio], Pair, Ordered]
     """Length-to-breadth ratio of the elliptical wavelet, 1 without wind."""
-    azimuth: Annotated[tuple[Degrees, Degrees], Pair, Ordered]
-    """Direction in which the head moves at step 0, degrees counter-clockwise from +x."""
-    wind_shift: Annotated[tuple[Turn, Turn], Pair, Ordered]
-    """Steady turning of that direction, degrees per 1000 steps, counter-clockwise."""
-    centre_x: Annotated[tuple[Fraction, Fraction], Pair, Ordered]
-    """Centre of the initial disc along x, as a fraction of the box (0 to X - 1)."""
-    centre_y: Annotated[tuple[Fraction, Fraction], Pair, Ordered]
-    """Centre of the initial disc along y, as a fraction of the box (0 to Y - 1)."""
-    core_radius: Annotated[tuple[Length, Length], Pair, Ordered]
-    """Radius of the initial disc, cells."""
-    ring_width: Annotated[tuple[Length, Length], Pair, Ordered]
-    """Width of the part of the disc that burns at step 0, cells; the rest is burnt out."""
     fuel_patches: Annotated[tuple[_Count, _Count], Pair, Ordered]
     """Number of patches of slow fuel."""
     patch_bearing: Annotated[tuple[Degrees, Degrees], Pair, Ordered]
@@ -103,13 +90,6 @@ class FireConfig:
     """Steps for which a cell burns; inf for ever."""
     lengths: Literal["scaled", "cells"] = "scaled"
     """Whether lengths and rates are for a 30-cell side and scaled to the grid, or in its cells."""
-    test_seed: TestSeed = TEST_FROM
-    """Seed of the first test fire."""
-
-
-_FIXED = {"name", "num_train_fires", "two_sided", "burn_time", "lengths", "test_seed"}
-# The position is part of a draw's key: append new fields, never reorder.
-_DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in _FIXED)
 
 
 GeneratedConfig = FireConfig | ReactionConfig
@@ -200,7 +180,7 @@ def _spread(
 ) -> Tensor:
     """Computes the fires of some seeds together; see `make_fires`."""
     scale = _scale(config, grid)
-    draw = {field: _draw(config, field, seeds)[:, 0] for field in _DRAWN if "patch" not in field}
+    draw = {name: config.draw(name, seeds)[:, 0] for name in config.drawn if "patch" not in name}
     fractions = torch.stack([draw["centre_x"], draw["centre_y"]], 1)
     centre = fractions * (torch.tensor(grid, device=seeds.device) - 1)
     distance = disc(centre, draw["core_radius"] * scale)
@@ -230,12 +210,6 @@ def _spread(
     return arrival.masked_fill(depth > draw["ring_width"][:, None, None] * scale, math.inf)
 
 
-def _draw(config: FireConfig, field: str, seeds: Tensor, count: int = 1) -> Tensor:
-    """Returns uniform draws from the range of a field, float32 [fires, count]."""
-    low, high = getattr(config, field)
-    return low + (high - low) * unit_draws(seeds, _DRAWN.index(field), count)
-
-
 def _axes(grid: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
     x, y = (torch.arange(side, dtype=torch.float32, device=device) for side in grid)
     return x[None, :, None], y[None, None, :]
@@ -255,10 +229,9 @@ def _fuel(
         return None
     scale = _scale(config, grid)
     low = config.fuel_patches[0]
-    drawn = unit_draws(seeds, _DRAWN.index("fuel_patches"), 1)
-    count = low + (drawn * (maximum - low + 1)).floor()
+    count = low + (config.unit_draws("fuel_patches", seeds) * (maximum - low + 1)).floor()
     bearing, distance, width, rate = (
-        _draw(config, f"patch_{part}", seeds, maximum)
+        config.draw(f"patch_{part}", seeds, maximum)
         for part in ("bearing", "distance", "radius", "rate")
     )
     angle = azimuth[:, None] + bearing.deg2rad()

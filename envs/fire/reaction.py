@@ -16,7 +16,7 @@ mean of neighbours with positive weights. Temperature and fuel therefore stay po
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from pydantic import Field, model_validator
@@ -25,19 +25,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from emberlink.envs.config import BASE_SIDE
-from emberlink.envs.fire.ranges import (
-    TEST_FROM,
-    Degrees,
-    Fraction,
-    Length,
-    Ordered,
-    Pair,
-    TestSeed,
-    Turn,
-    unit_draws,
-)
+from emberlink.envs.fire.ranges import FireRanges, Ordered, Pair
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import STRICT, Name
+from emberlink.envs.utils.validation import STRICT
 
 Reaction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """from temperature rise and fuel to their rates of change"""
@@ -52,15 +42,15 @@ _Kelvin = Annotated[float, Field(ge=200, le=3000)]
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class ReactionConfig:
+class ReactionConfig(FireRanges):
     """A distribution of fires of the heat equation: a pair is the range of a uniform draw."""
 
+    drawn: ClassVar[tuple[str, ...]] = (
+        *("wind_speed", "azimuth", "wind_shift"),
+        *("centre_x", "centre_y", "core_radius", "ring_width"),
+    )
     kind: Literal["reaction"]
     """Distinguishes it from other scenarios."""
-    name: Name
-    """Name of the scenario and its file."""
-    num_train_fires: Annotated[int, Field(ge=1, lt=1_000_000)]
-    """Number of fires to train on."""
     cell_size: Annotated[float, Field(gt=0, le=1000)]
     """Side of a cell of a 30-cell side, m."""
     step_duration: Annotated[float, Field(gt=0, le=3600)]
@@ -85,20 +75,6 @@ class ReactionConfig:
     """Fraction of the fuel at which a cell is burnt out."""
     wind_speed: Annotated[tuple[_Wind, _Wind], Pair, Ordered]
     """Speed at which the wind carries the heat of the fire, m/s."""
-    azimuth: Annotated[tuple[Degrees, Degrees], Pair, Ordered]
-    """Direction towards which the wind blows at step 0, degrees counter-clockwise from +x."""
-    wind_shift: Annotated[tuple[Turn, Turn], Pair, Ordered]
-    """Steady turning of that direction, degrees per 1000 steps, counter-clockwise."""
-    centre_x: Annotated[tuple[Fraction, Fraction], Pair, Ordered]
-    """Centre of the initial disc along x, as a fraction of the box (0 to X - 1)."""
-    centre_y: Annotated[tuple[Fraction, Fraction], Pair, Ordered]
-    """Centre of the initial disc along y, as a fraction of the box (0 to Y - 1)."""
-    core_radius: Annotated[tuple[Length, Length], Pair, Ordered]
-    """Radius of the initial disc, cells."""
-    ring_width: Annotated[tuple[Length, Length], Pair, Ordered]
-    """Width of the part of the disc that burns at step 0, cells; the rest is burnt out."""
-    test_seed: TestSeed = TEST_FROM
-    """Seed of the first test fire."""
 
     @property
     def thickness(self) -> float:
@@ -132,13 +108,6 @@ class ReactionConfig:
                 "these coefficients and this wind"
             )
         return self
-
-
-# The position is part of a draw's key: append new fields, never reorder.
-_DRAWN = (
-    *("wind_speed", "azimuth", "wind_shift"),
-    *("centre_x", "centre_y", "core_radius", "ring_width"),
-)
 
 
 def arrhenius(config: ReactionConfig) -> Reaction:
@@ -234,11 +203,7 @@ def _burn(
     border: int,
 ) -> Tensor:
     """Computes the fires of some seeds together; see `reaction_fires`."""
-    draw = {
-        name: low + (high - low) * unit_draws(seeds, number, 1)[:, 0]
-        for number, name in enumerate(_DRAWN)
-        for low, high in [getattr(config, name)]
-    }
+    draw = {name: config.draw(name, seeds)[:, 0] for name in config.drawn}
     spacing = config.cell_size * BASE_SIDE / min(grid) / refine
     step = time_step(config, spacing)
     start, turning = draw["azimuth"].deg2rad(), draw["wind_shift"].deg2rad()
