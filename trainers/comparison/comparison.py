@@ -100,10 +100,10 @@ class Comparison:
         p = bootstrap.crossed_p(bootstrap.iqm_difference, *samples)
         return Difference(iqms[0] - iqms[1], ends, p)
 
-    def to_values(self) -> dict[str, Any]:
-        """Returns all results as plain values, the content of compare.json."""
+    def to_json(self) -> str:
+        """Returns all results as JSON, with the text "inf" for infinite numbers."""
         of_label = self.curves.groupby(["section", "label", "measure"], sort=False)
-        return {
+        values = {
             "settings": about(),
             "command": self.command,
             "left_out": [{"run": path, "why": why} for path, why in self.left_out],
@@ -114,10 +114,7 @@ class Comparison:
             "communication": _records(self.communication),
             "curves": _records(of_label[["iqm", "low", "high"]].agg(list).reset_index()),
         }
-
-    def to_json(self) -> str:
-        """Returns all results as JSON, with the text "inf" for infinite numbers."""
-        return json.dumps(self.to_values(), indent=1, allow_nan=False) + "\n"
+        return json.dumps(values, indent=1, allow_nan=False) + "\n"
 
 
 def _records(table: Frame) -> list[dict[str, Any]]:
