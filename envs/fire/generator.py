@@ -204,7 +204,6 @@ def _spread(
         refine=refine,
         rate_field=_fuel(config, seeds, centre, draw["core_radius"], start, grid),
         max_rate=(config.head_ros[1] + fastest) * scale,
-        device=seeds.device,
     )
     depth = -distance(*_axes(grid, seeds.device))
     return arrival.masked_fill(depth > draw["ring_width"][:, None, None] * scale, math.inf)

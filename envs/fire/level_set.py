@@ -83,7 +83,6 @@ def arrival_times(
     rate_field: Tensor | None = None,
     max_rate: float | None = None,
     max_step: float = math.inf,
-    device: torch.device | str | None = None,
 ) -> Tensor:
     """Computes when a front that starts at `distance` = 0 arrives at the centre of each cell.
 
@@ -98,13 +97,12 @@ def arrival_times(
         max_rate: upper bound of (head rate + speed of the drift) · multiplier, cells per step; by
             default of the head rate and the multiplier, without a drift.
         max_step: upper bound of a time step, for functions that vary faster than the front moves.
-        device: of the computation.
 
     Returns:
         [fires, X, Y], steps: 0 where the front is at the start, inf where it does not arrive.
     """
     pad = _PAD + margin
-    x, y = (_nodes(cells, pad, refine, device) for cells in grid)
+    x, y = (_nodes(cells, pad, refine, head_ros.device) for cells in grid)
     phi = distance(x[None, :, None], y[None, None, :])
     rates = torch.ones(()) if rate_field is None else _refined(rate_field.to(phi), grid, x, y)
     wavelet = ellipse_rates(head_ros.to(phi), length_to_breadth.to(phi), two_sided)
@@ -133,7 +131,7 @@ def arrival_times(
     return arrival.masked_fill(arrival > horizon, math.inf)
 
 
-def _nodes(cells: int, pad: int, refine: int, device: torch.device | str | None) -> Tensor:
+def _nodes(cells: int, pad: int, refine: int, device: torch.device) -> Tensor:
     """Returns the fine nodes of one axis; every `refine`-th is the centre of a cell."""
     count = (cells - 1 + 2 * pad) * refine + 1
     return torch.arange(count, device=device, dtype=torch.float32) / refine - pad

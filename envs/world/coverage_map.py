@@ -178,7 +178,6 @@ class CoverageMap(nn.Module):
     _fires_end: Tensor | None
     _start: Tensor
     _uav: Tensor
-    _never: Tensor
     _arrival_time: Tensor
     _burn_out: Tensor | None
     _fire_index: Tensor
@@ -215,7 +214,6 @@ class CoverageMap(nn.Module):
         self.register_buffer(
             "_uav", torch.arange(uavs, dtype=torch.int32).unsqueeze(-1), persistent=False
         )
-        self.register_buffer("_never", torch.tensor(_NEVER, dtype=torch.int32), persistent=False)
         self.register_buffer("_arrival_time", self._fires[:1].repeat(envs, 1))
         self.register_buffer("_burn_out", None if ends is None else ends[:1].repeat(envs, 1))
         self.register_buffer("_fire_index", torch.zeros(envs, dtype=torch.int64))
@@ -301,7 +299,7 @@ class CoverageMap(nn.Module):
         if self._burn_out is not None:
             burnt_out = burns & (self._burn_out.take(cells) <= time)
             burns, no_fire = burns ^ burnt_out, no_fire | burnt_out
-        claims = torch.where(burns, stamp, self._never)
+        claims = torch.where(burns, stamp, _NEVER)
 
         def new(first_seen: Tensor, at: Tensor) -> Tensor:
             first_seen.view(-1).scatter_reduce_(0, at.view(-1), claims.view(-1), "amin")

@@ -87,9 +87,20 @@ class SequenceNetwork(nn.Module):
         """
         rows, decisions, uavs = observations[0].shape[:3]
         batch, split, join = torch.Size((rows, uavs)), self.grouping.split, self.grouping.join
-        seen, hears = self._apart(observations)
-        arranged = [split(x.transpose(1, 2), batch) for x in self._indexed(seen)]
-        output, after = self._run(arranged, split(state, batch), hears)
+        first, *others = observations if self.messages is None else observations[:-1]
+        first = self.grouping.with_index(first) if self.agent_index else first
+        arranged = [split(x.transpose(1, 2), batch) for x in (first, *others)]
+        each = arranged[0].shape[1:3]
+        encoded = self.encoder([x.flatten(1, 2) for x in arranged]).unflatten(1, each)
+        before = split(state, batch)
+        if self.messages is None:
+            x, after = self.memory(encoded, before)
+        else:
+            x, after = self._converse(self.messages, encoded, before, observations[-1])
+        x = x.flatten(1, 2)
+        for layer in self.hidden:
+            x = layer(x).tanh()
+        output = self.output(x).unflatten(1, each)
         joined = join(output.flatten(2), batch).unflatten(-1, (decisions, -1))
         return joined.transpose(1, 2), join(after, batch)
 
@@ -103,30 +114,13 @@ class SequenceNetwork(nn.Module):
         Returns:
             Outputs, [*batch, uavs, outputs], and the new state, [*batch, uavs, size].
         """
-        batch = observations[0].shape[:-1]
-        split = self.grouping.split
-        observations, hears = self._apart(observations)
-        if hears is not None:
-            hears = hears.reshape(-1, 1, *hears.shape[-2:])
-        arranged = [split(x, batch).unsqueeze(2) for x in self._indexed(observations)]
-        before = self._empty(arranged[0]) if state is None else split(state, batch)
-        output, after = self._run(arranged, before, hears)
-        return self.grouping.join(output.squeeze(2), batch), self.grouping.join(after, batch)
-
-    def _run(
-        self, tensors: Sequence[Tensor], state: Tensor, hears: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Maps tensors [groups, rows, decisions, ...] and returns the state after the last."""
-        rows, decisions = tensors[0].shape[1:3]
-        encoded = self.encoder([x.flatten(1, 2) for x in tensors]).unflatten(1, (rows, decisions))
-        if self.messages is None or hears is None:
-            x, state = self.memory(encoded, state)
-        else:
-            x, state = self._converse(self.messages, encoded, state, hears)
-        x = x.flatten(1, 2)
-        for layer in self.hidden:
-            x = layer(x).tanh()
-        return self.output(x).unflatten(1, (rows, decisions)), state
+        *batch, uavs = observations[0].shape[:-1]
+        rows = math.prod(batch)
+        size = rows, uavs, self.memory.size
+        before = self.output.weight.new_zeros(size) if state is None else state.reshape(size)
+        each = [x.reshape(rows, 1, *x.shape[len(batch) :]) for x in observations]
+        output, after = SequenceNetwork.forward(self, before, *each)
+        return output.reshape(*batch, uavs, -1), after.reshape(*batch, uavs, self.memory.size)
 
     def _converse(
         self, messages: Messages, encoded: Tensor, state: Tensor, hears: Tensor
@@ -145,24 +139,9 @@ class SequenceNetwork(nn.Module):
             features.append(x)
         return torch.cat(features, 2), state
 
-    def _apart(self, observations: Sequence[Tensor]) -> tuple[Sequence[Tensor], Tensor | None]:
-        """Returns the tensors that are encoded, and the links if there are messages."""
-        if self.messages is None:
-            return observations, None
-        return observations[:-1], observations[-1]
-
     def empty_state(self, rows: int) -> Tensor:
         """Returns the state before the first decision, [rows, uavs, size]."""
         return self.output.weight.new_zeros(rows, self.grouping.uavs, self.memory.size)
-
-    def _empty(self, x: Tensor) -> Tensor:
-        return x.new_zeros(*x.shape[:2], self.memory.size)
-
-    def _indexed(self, observations: Sequence[Tensor]) -> Sequence[Tensor]:
-        if not self.agent_index:
-            return observations
-        first, *others = observations
-        return [self.grouping.with_index(first), *others]
 
 
 class GaussianNetwork(SequenceNetwork):

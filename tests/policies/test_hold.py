@@ -9,7 +9,7 @@ from torchrl.envs import TransformedEnv, check_env_specs, step_mdp
 from emberlink.comm.base import Communication
 from emberlink.envs import WildfireEnv, keys, metrics
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.hold import HELD, Held, held
+from emberlink.policies.hold import HELD, Held
 from emberlink.policies.state import Stateful
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
@@ -31,11 +31,6 @@ class Counting(Stateful):
         before = torch.zeros_like(tensordict.get(keys.POSITION)) if before is None else before
         tensordict.set(("next", *COUNT), before + 1)
         return tensordict.set(keys.ACTION, before + 1)
-
-
-def test_holding_for_one_step_is_the_policy_itself():
-    policy = Counting()
-    assert held(policy, 1, 2) is policy
 
 
 def test_an_action_is_held_and_what_is_carried_changes_at_decisions_alone():
@@ -165,11 +160,6 @@ def test_the_horizon_is_a_multiple_of_the_held_steps():
     config = resolve("independent", ["policy.hold=7", "env.horizon=20"])
     with pytest.raises(UserError, match=r"env.horizon=20: must be a multiple of 7, the steps"):
         TrainingSetup(config)
-
-
-def test_the_environment_holds_actions_for_a_part_of_the_horizon():
-    with pytest.raises(UserError, match="hold=7: expected a divisor of the horizon, 1000 steps"):
-        WildfireEnv(1, hold=7)
 
 
 def test_an_evaluation_of_held_actions_equals_one_step_by_step():

@@ -13,17 +13,9 @@ from emberlink.envs.config import RadioConfig
 from emberlink.envs.world import radio
 from emberlink.policies.scripted.map_greedy import Courier, MapGreedy, Shuttle, ShuttleAll
 from emberlink.policies.scripted.oracle import Oracle, OracleShuttle
-from emberlink.policies.scripted.planning import next_report
 
 NEVER = math.inf
 BASE = torch.tensor([0.0, 30.0])
-
-
-def test_reports_are_due_at_multiples_and_at_the_end():
-    step = torch.tensor([0, 249, 250, 760, 999, 1000, 1100])
-    due = next_report(step, 250, 1000).squeeze(-1).tolist()
-    assert due == [250, 250, 500, 1000, 1000, 1000, 1000]
-    assert next_report(step[:4], 1000, 900).squeeze(-1).tolist() == [900] * 4
 
 
 def played(env, policy, steps: int, position=None):

@@ -11,7 +11,7 @@ from burning import burning_cells
 from pydantic import ValidationError
 
 from emberlink.envs.fire import cache as bank_module
-from emberlink.envs.fire.cache import bank_key, fire_bank
+from emberlink.envs.fire.cache import fire_bank
 from emberlink.envs.fire.generator import (
     TEST_FROM,
     FireConfig,
@@ -22,11 +22,6 @@ from emberlink.envs.fire.generator import (
 )
 
 GRID, HORIZON = (30, 30), 1000
-RANGES = [
-    f.name
-    for f in dataclasses.fields(FireConfig)
-    if f.name not in {"name", "num_train_fires", "two_sided", "burn_time", "lengths", "test_seed"}
-]
 
 
 def settings_of(**changes: Any) -> dict[str, Any]:
@@ -174,25 +169,3 @@ def test_a_bank_is_computed_once(name, shape, tmp_path: Path, calls: list[int]):
     assert [file.suffix for file in tmp_path.iterdir()] == [".npy"]
     seeds = fire_seeds("train", 2)
     assert torch.equal(first, make_fires(load_scenario(name), seeds, (12, 10), 50))
-
-
-def test_the_cache_key_depends_on_every_setting(monkeypatch: pytest.MonkeyPatch):
-    base = settings_of()
-    args = {"split": "train", "count": 2, "grid": (12, 10), "horizon": 50}
-
-    def key(config=base, **changes):
-        return bank_key(FireConfig(**config), **{**args, **changes})
-
-    keys = [key(), key(split="test"), key(count=3), key(grid=(10, 12)), key(horizon=51)]
-    keys += [key({**base, "name": "other"}), key({**base, "num_train_fires": 3})]
-    keys += [key({**base, "two_sided": True}), key({**base, "lengths": "cells"})]
-    # Burn-out is computed from the arrival times in a bank.
-    assert key({**base, "burn_time": 3.0}) == keys[0]
-    for field in RANGES:
-        low, high = base[field]
-        more = 1 if field == "fuel_patches" else 0.001
-        other = (low, low) if low < high else (low, high + more)
-        keys.append(key({**base, field: other}))
-    monkeypatch.setattr(bank_module, "GENERATOR_VERSION", 999)
-    keys.append(key())
-    assert len(set(keys)) == len(keys) == 10 + len(RANGES)
