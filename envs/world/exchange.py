@@ -244,28 +244,28 @@ class Exchange(nn.Module):
     def _listen(self, known: Knowledge, entry: Tensor, code: Tensor, arrives: Tensor) -> Tensor:
         """Enters what arrives into the maps; returns the changes, see `forward`."""
         radios, items = self.shape[1:]
-        row = entry // items
-        which, hearer = arrives.mT.flatten(0, 1)[row].nonzero(as_tuple=True)
-        row, cell, code = row[which], entry[which] % items, code[which]
+        row, cell = entry // items, entry % items
         env, speaker = row // radios, row % radios
-        target = (env * radios + hearer) * items + cell
-        changed = newer(code, codes(known, target))
-        told_again = changed
+        which, hearer = arrives.mT.flatten(0, 1)[row].nonzero(as_tuple=True)
+        target = (env * radios * items + cell)[which] + hearer * items
+        link = (env * radios * radios + speaker)[which] + hearer * radios
+        code, last, seen = code[which], known.last_seen, known.seen_fire
+        changed = told_again = newer(code, codes(known, target))
         if self.free:
             # Nor need it be passed on to those in range of a hearer who have all heard it, too.
             missed = ~arrives & ~torch.eye(radios, dtype=torch.bool, device=arrives.device)
             relays = (self.contact.float() @ missed.float()) > 0  # [envs, hearers, speakers]
-            told_again = changed & relays.view(-1)[target // items * radios + speaker]
+            told_again = changed & relays.take(link)
         self.pending.view(-1)[target[told_again]] = True
-        last, seen = known.last_seen, known.seen_fire
         assert seen is not None
         last.view(-1).scatter_reduce_(0, target, (code >> 1).to(last.dtype), "amax")
         mark(seen, target, (code & 1) > 0)
         if not self.free:
-            at = target * radios + speaker
+            at = target * radios + link % radios
             self.has.view(-1)[at] = merged(self.has.view(-1)[at], code)
-        newest = changed & (code >> 1 == last.view(-1)[target])
-        return torch.stack((env, hearer, speaker, cell))[:, newest]
+        new = (changed & (code >> 1 == last.take(target))).nonzero().squeeze(-1)
+        which = which[new]
+        return torch.stack((env[which], hearer[new], speaker[which], cell[which]))
 
 
 def share(
@@ -308,7 +308,7 @@ def step_bytes(horizon: int) -> int:
 def codes(known: Knowledge, entry: Tensor) -> Tensor:
     """Returns the codes of entries of the flat maps, int32."""
     assert known.seen_fire is not None
-    return 2 * known.last_seen.view(-1)[entry].int() + known.seen_fire.view(-1)[entry]
+    return 2 * known.last_seen.take(entry).int() + known.seen_fire.take(entry)
 
 
 def newer(told: Tensor, theirs: Tensor) -> Tensor:
