@@ -5,6 +5,7 @@ import os
 import pwd
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 from refusal import refused
 from tiny_run import TINY
 from torchrl.envs.utils import exploration_type
@@ -40,9 +41,11 @@ def test_home_folders_are_expanded(tmp_path, monkeypatch):
     (tmp_path / "setup").mkdir()
     (tmp_path / "setup" / "mine.yaml").write_text("# @package _global_\ndefaults: [tuned]\n")
     monkeypatch.setenv("EMBERLINK_CONFIGS", "~")
-    make = ["fire", "make", "paper", "--count=1", "--output=~/fires.npy", "env.grid=[9,9]"]
-    assert main([*make, "setup=mine"]) == 0
-    assert main(["fire", "preview", "~/fires.npy", "--output=~/fire.png", "env.grid=[9,9]"]) == 0
+    np.save("drawn.npy", np.add.outer(np.arange(9.0), np.arange(9.0))[None])
+    grid = ["env.grid=[9,9]", "fire.unburned=none"]
+    more = [*grid, "setup=mine"]
+    assert main(["fire", "import", "~/drawn.npy", "--output=~/fires.npy", *more]) == 0
+    assert main(["fire", "preview", "~/fires.npy", "--output=~/fire.png", *grid]) == 0
     policy = trainers.load("pretrained:consensus")
     (tmp_path / "here").write_bytes(policy.checkpoint.read_bytes())
     assert trainers.load("pretrained:consensus", checkpoint="~/here").checkpoint.parent == tmp_path
