@@ -2,12 +2,9 @@
 
 import logging
 import os
-import pwd
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from refusal import refused
-from tiny_run import TINY
 from torchrl.envs.utils import exploration_type
 
 from emberlink import trainers
@@ -51,10 +48,3 @@ def test_home_folders_are_expanded(tmp_path, monkeypatch):
     assert trainers.load("pretrained:consensus", checkpoint="~/here").checkpoint.parent == tmp_path
     assert not (tmp_path / "~").exists()
     assert {"fires.npy", "fire.png"} < {file.name for file in tmp_path.iterdir()}
-
-
-def test_an_account_without_a_home_folder_is_one_line(monkeypatch, capsys):
-    for name in ("HOME", "XDG_CACHE_HOME", "EMBERLINK_CACHE"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(pwd, "getpwuid", {}.__getitem__)
-    refused(["train", "independent", *TINY], capsys, "HOME")

@@ -1,7 +1,6 @@
 """Tests the output and the files of the commands."""
 
 import json
-import warnings
 
 import pytest
 from tiny_run import TINY
@@ -10,7 +9,6 @@ from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs import checkpoint
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.terminal.console import SafeConsole
 
 POLICIES = resolve("consensus").evaluation.scripted
 
@@ -61,20 +59,3 @@ def test_an_internal_error_keeps_its_traceback(monkeypatch):
     monkeypatch.setattr("emberlink.trainers.training.command.resolve", fail)
     with pytest.raises(ValueError, match="longer than"):
         main.main(["train", "independent"])
-
-
-def test_a_warning_is_one_line_and_printed_once(monkeypatch):
-    said = []
-
-    def warn(**_) -> int:
-        said.extend(warnings.formatwarning("two\nlines", UserWarning, "x.py", 3) for _ in "ab")
-        return 0
-
-    monkeypatch.setattr("emberlink.trainers.sweep.command.sweep", warn)
-    assert main.main(["sweep", "consensus"]) == 0
-    assert said == ["emberlink: warning: two lines\n", ""]
-
-
-def test_escape_sequences_of_names_are_not_printed(capsys):
-    SafeConsole().print("run\x1b[31m\x1b]0;title\x9b1m\u202egnp.exe", style="bold")
-    assert capsys.readouterr().out == "run?[31m?]0;title?1m?gnp.exe\n"

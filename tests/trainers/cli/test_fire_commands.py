@@ -1,7 +1,6 @@
 """Tests `emberlink fire`: pictures, numbers, banks and errors."""
 
 import json
-import resource
 from pathlib import Path
 
 import numpy as np
@@ -168,17 +167,3 @@ def test_preview_takes_the_keys_of_train(capsys, tmp_path):
     *again, second = ran(capsys, "preview", "paper", "--output", tmp_path)
     assert again == lines
     assert (first, second) == ("fire_paper_0.png", str(tmp_path / "fire_paper_0_2.png"))
-
-
-@pytest.mark.slow
-def test_a_full_disk_gives_one_line_and_leaves_no_files(capsys, tmp_path):
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    asc(tmp_path / "fire.asc", disc())
-    importing = ["import", "fire.asc", "fire.units=minutes", "--output", "a.npy"]
-    for arguments in (importing, ["preview", "huygens"]):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
-        try:
-            assert "File too large" in refused(capsys, *arguments)
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        assert [path.name for path in tmp_path.iterdir()] == ["fire.asc"]

@@ -6,8 +6,6 @@ import os
 import resource
 import shutil
 import struct
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -16,11 +14,9 @@ import pytest
 import torch
 import yaml
 from refusal import refused
-from tiny_run import TINY
 
 from emberlink.envs.fire.cache import bank_key, fire_bank
 from emberlink.envs.fire.generator import load_scenario
-from emberlink.trainers.cli import main
 from emberlink.trainers.runs.run_folder import RunFolder
 
 
@@ -141,24 +137,6 @@ def test_a_cached_bank_of_fires_is_computed_again(kind, tmp_path, mark, monkeypa
     assert not mark.exists()
 
 
-OVERRIDES = [
-    "env._target_=os.system",
-    "setup_method=../../mark",
-    "fire=/etc/passwd",
-    'seed=${oc.decode:\'__import__("os").mkdir("mark")\'}',
-    "seeds=" + "[" * 3000 + "]" * 3000,
-    "seed=" + "9" * 5000,
-    "comm.name=../registry",
-]
-
-
-@pytest.mark.parametrize("text", OVERRIDES, ids=lambda text: text[:30])
-def test_an_override(text, tmp_path, mark, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    harmless(["train", "consensus", *TINY, text], capsys, mark)
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
@@ -184,39 +162,3 @@ def test_a_run_folder_with_a_link_or_a_pipe_is_refused(name, kind, run, mark, ca
     assert str(path) in harmless(["compare", run, "--output", tmp_path / "out"], capsys, mark)
     assert mine.read_text() == "mine"
     assert {p.name for p in tmp_path.iterdir()} <= {"mine", "run"}
-
-
-def test_a_hard_link_is_not_written_through(run, tmp_path):
-    mine = tmp_path / "mine"
-    mine.write_bytes((run / "metrics.jsonl").read_bytes())
-    before = mine.read_bytes()
-    (run / "metrics.jsonl").unlink()
-    (run / "metrics.jsonl").hardlink_to(mine)
-    assert main.main(["train", f"resume={run}", "episodes=3"]) == 0
-    assert len(RunFolder(run).metrics()) == 3
-    (run / "lock").hardlink_to(mine)
-    assert main.main(["train", f"resume={run}", "episodes=4"]) == 2
-    assert mine.read_bytes() == before
-
-
-@pytest.mark.slow
-def test_files_of_the_working_folder_are_not_executed(tmp_path, mark):
-    """Modules and settings in the working folder are ignored; a mistake is one line."""
-    bomb = f"import os\nos.mkdir({str(mark)!r})\n"
-    for name in ("torch", "yaml", "hydra", "wandb", "comm", "configs", "sitecustomize"):
-        (tmp_path / f"{name}.py").write_text(bomb)
-    (tmp_path / "conf").mkdir()
-    (tmp_path / "base.yaml").write_text("seed: 99\n")
-    before = sorted(tmp_path.rglob("*"))
-    program = Path(sys.executable).with_name("emberlink")
-    done = subprocess.run(
-        [program, "train", "consensus", "env.horizn=3"],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        check=False,
-    )
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-    assert "key 'env.horizn' is not known; did you mean env.horizon?" in done.stderr
-    assert not mark.exists()
-    assert sorted(tmp_path.rglob("*")) == before

@@ -137,11 +137,3 @@ def test_errors_of_render(tmp_path, capsys):
     refused(["render", run], capsys, "holds no checkpoint")
     assert there.read_text() == "mine"
     assert not [*tmp_path.rglob("*.mp4"), *tmp_path.rglob("*.png")]
-
-
-def test_a_failing_ffmpeg_gives_one_line(tmp_path, capsys, monkeypatch):
-    run = make_run(tmp_path)
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "false")
-    refused(["render", run, "--output", tmp_path / "a.mp4"], capsys, "a.mp4", "ffmpeg failed")
-    assert not list(tmp_path.glob("*.mp4"))
-    assert not list(tmp_path.glob(".*"))

@@ -104,13 +104,6 @@ def test_what_is_refused_leaves_no_copy(shipped, tmp_path, capsys, arguments, me
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_copy_of_another_version_is_not_taken_for_this_one(shipped, capsys):
-    run = pretrained.open_run("pretrained:consensus")
-    content = run.newest.read_bytes()
-    run.newest.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    refused(["eval", "pretrained:consensus"], capsys, "holds other networks than pretrained")
-
-
 def test_names_of_several_policies(shipped):
     def names(text: str) -> list[str]:
         return ["/".join(path.parts[-2:]) for path in pretrained.find(text)]
