@@ -1,4 +1,4 @@
-"""Tests that the package fits into other programs: threads, paths, accounts, hints."""
+"""Tests that the package fits into other programs: threads and paths."""
 
 import logging
 import os
