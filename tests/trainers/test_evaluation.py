@@ -72,7 +72,7 @@ def test_an_action_that_is_not_finite_is_an_error():
         action[1, 2, 0] = torch.nan if td[keys.STEP][0] == 3 else 0
         return td.set(keys.ACTION, action)
 
-    message = r"action is nan for UAV 2 of environment 1 at step 4; expected finite numbers"
+    message = "UAV 2 of environment 1 at step 4"
     with pytest.raises(UserError, match=message):
         evaluate.play(env, policy)
 

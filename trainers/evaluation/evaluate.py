@@ -31,7 +31,6 @@ from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.scores import LEARNED, Measured, Results, means
-from emberlink.trainers.rollout.finite_actions import check_finite
 
 HELD_OUT_SCENARIO = "huygens"
 """the scenario of evaluations with `evaluation.huygens`, besides the training's"""
@@ -46,6 +45,10 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 Watch = Callable[[WildfireEnv, TensorDictBase], None]
 """called at each step, from 0 to the horizon with the environments and what they returned: the
 result of the reset, or the "next" of the step"""
+
+
+class NonFiniteActionError(UserError):
+    """Reports the first action of an episode that is NaN or infinite."""
 
 
 def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dict[str, Tensor]:
@@ -75,7 +78,13 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
                 watch(world, after)
             steps.append(metrics.measured_steps(after.unsqueeze(1)))
             td = step_mdp(td, keep_other=True)
-    check_finite(torch.stack(actions))
+    wrong = ~torch.stack(actions).isfinite()
+    if wrong.any():
+        step, environment, uav, _ = wrong.nonzero()[0].tolist()
+        raise NonFiniteActionError(
+            f"the policy's action is NaN or infinite for UAV {uav} of environment {environment} at "
+            f"step {step + 1}"
+        )
     episode: Any = torch.cat(cast(Any, steps), 1)
     return metrics.episode_metrics(episode)
 

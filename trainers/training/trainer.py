@@ -15,7 +15,6 @@ from emberlink.trainers.evaluation.evaluate_run import evaluate_run
 from emberlink.trainers.evaluation.policy import TrainedPolicy
 from emberlink.trainers.evaluation.scores import Results, learned_means, validated
 from emberlink.trainers.learners.base import Losses
-from emberlink.trainers.rollout.finite_actions import NonFiniteActionError
 from emberlink.trainers.runs import checkpoint
 from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.runs.run_folder import BEST, RunFolder
@@ -192,8 +191,8 @@ class Trainer:
         if interval and setup.episode % interval == 0:
             try:
                 line |= evaluate.validate(self.config, setup.actor)
-            except NonFiniteActionError as error:
-                raise self._non_finite("an action of the validation", error.value) from None
+            except evaluate.NonFiniteActionError:
+                raise self._non_finite("an action of the validation") from None
         self._keep_best(line)
         self.tracker.log(line)  # first, since a new tracker logs the lines before it
         self.run.append(line)

@@ -7,7 +7,6 @@ from test_resume import REPLAY, begun
 
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation import evaluate
-from emberlink.trainers.rollout.finite_actions import NonFiniteActionError
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import NonFiniteError, Trainer
 
@@ -47,7 +46,7 @@ def test_the_training_ends_and_the_last_checkpoint_stays(where, kind, tmp_path):
 
 def test_a_validation_with_an_action_that_is_not_finite(tmp_path, monkeypatch):
     def validate(*_):
-        raise NonFiniteActionError("nan", 0, 0, 3)
+        raise evaluate.NonFiniteActionError
 
     trainer = begun("independent", tmp_path, *REPLAY, "evaluation.interval=1")
     monkeypatch.setattr(evaluate, "validate", validate)
