@@ -83,9 +83,3 @@ def test_a_uav_observes_its_own_vector_first(reach):
             other = (uav + place) % UAVS
             shown = mine[keys.OBSERVATION][:, uav, 6 * place : 6 * place + 6]
             assert shown.equal(theirs[keys.OBSERVATION][:, uav, 6 * other : 6 * other + 6])
-
-
-@pytest.mark.filterwarnings("error::UserWarning")
-@pytest.mark.parametrize("method", EVERY)
-def test_every_method_heeds_delay_and_bandwidth(method):
-    recipe(method, **{"env.radio.bandwidth": 20, "env.radio.delay": 2})

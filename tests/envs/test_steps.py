@@ -87,12 +87,3 @@ def test_equals_the_scalar_environment(case):
             assert td[keys.SEEN][e].item() == scalar.seen()
             assert td[keys.BURNING][e].item() == scalar.burning()
     assert left > 50, "the actions were to push out of the box"
-
-
-def test_the_largest_world_runs():
-    config = WildfireConfig(grid=(256, 256), num_uavs=64, horizon=5)
-    env = WildfireEnv(2, config, "paper")
-    steps = env.rollout(5)
-    assert steps.batch_size == (2, 5)
-    assert steps["next"][keys.REWARD].isfinite().all()
-    assert (steps["next"][keys.BURNING] > 77).all()

@@ -62,16 +62,6 @@ def test_a_notice_saves_at_the_next_step(number, tmp_path, monkeypatch, capsys):
     assert f"resume with: emberlink train resume={folder}" in capsys.readouterr().out
 
 
-def test_ctrl_c_during_the_evaluation_ends_at_once(tmp_path, monkeypatch, capsys):
-    def evaluate(*_):
-        os.kill(os.getpid(), INT)
-        raise AssertionError("it has gone on")
-
-    monkeypatch.setattr(Trainer, "evaluate", evaluate)
-    assert main(["train", "independent", *TINY, f"output={tmp_path}"]) == 128 + INT
-    assert "resume with" in capsys.readouterr().out
-
-
 def test_ctrl_c_in_a_function_saves_and_restores_the_handler(tmp_path):
     def press(progress: Progress) -> None:
         if progress.step == 7:

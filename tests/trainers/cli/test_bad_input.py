@@ -66,14 +66,6 @@ def test_a_wrong_name_or_value_is_answered_without_torch(wrong, seconds):
     assert float(spent) < 2 * seconds  # machines that test are slower than those of users
 
 
-def test_an_output_folder_that_is_a_file(tmp_path, capsys):
-    file = tmp_path / "file"
-    file.write_text("mine")
-    for output in (file, file / "below"):
-        refused(["train", "consensus", *TINY, f"output={output}"], capsys, f"output={output}")
-    assert file.read_text() == "mine"
-
-
 def test_invalid_run_folders(run, tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     refused(["eval", tmp_path / "nowhere"], capsys, "nowhere")

@@ -81,13 +81,6 @@ def test_a_radio_of_the_run_holds_for_the_methods_of_scripted_policies_too():
     assert scripted_config(off, "follow_target").env.radio.range == 0
 
 
-def test_settings_after_the_world_change_it():
-    run = resolve("maps", ["setup=tuned", "world=front"])
-    moved = evaluated_with(run, {"env.radio.range": 0, "world": "swarm", "env.num_uavs": 3})
-    assert (moved.world, moved.env.num_uavs, moved.env.radio.range) == ("swarm", 3, 0)
-    assert moved.learner == run.learner
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")

@@ -1,26 +1,11 @@
 """Tests that a run folder is locked by at most one training."""
 
-import errno
-import fcntl
 import os
 
-import pytest
 from refusal import refused
 from test_resume import REPLAY, begun, until
 
-from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.training.resume import resume
-
-
-def test_a_file_system_without_locks(tmp_path, monkeypatch):
-    def flock(handle: int, how: int) -> None:
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
-
-    monkeypatch.setattr(fcntl, "flock", flock)
-    with pytest.raises(ValueError, match=r"lock: cannot be locked: .*output=FOLDER"):
-        Lock(tmp_path)
-    with pytest.raises(ValueError, match="lock: cannot be locked"):
-        Lock(tmp_path / "missing")
 
 
 def test_two_trainings_in_one_folder(tmp_path, capsys):

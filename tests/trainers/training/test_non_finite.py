@@ -6,7 +6,6 @@ from refusal import refused
 from test_resume import REPLAY, begun
 
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import NonFiniteError, Trainer
 
@@ -42,18 +41,6 @@ def test_the_training_ends_and_the_last_checkpoint_stays(where, kind, tmp_path):
     assert ("loss critic is " in said) == (where == "loss")
     assert run.step() == 10
     resume(run.path).close()
-
-
-def test_a_validation_with_an_action_that_is_not_finite(tmp_path, monkeypatch):
-    def validate(*_):
-        raise evaluate.NonFiniteActionError
-
-    trainer = begun("independent", tmp_path, *REPLAY, "evaluation.interval=1")
-    monkeypatch.setattr(evaluate, "validate", validate)
-    with pytest.raises(NonFiniteError, match="at step 20; there is no checkpoint"):
-        trainer.train()
-    trainer.close()
-    assert trainer.run.metrics() == []
 
 
 def test_the_command_ends_with_one_line(tmp_path, capsys):

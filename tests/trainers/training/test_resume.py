@@ -5,12 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 from refusal import refused
 from test_recipes import METHODS
-from torchrl.envs import check_env_specs
 
-from emberlink.trainers import make_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs import checkpoint
@@ -261,21 +258,3 @@ def test_the_best_networks_are_chosen_anew_by_another_measure(paused):
         trainer = resume(paused, overrides=[text.replace("exits", "tracking_last")])
         trainer.close()
         assert trainer.best == best
-
-
-def test_the_default_dtype_does_not_change_a_training(tmp_path):
-    """A program that uses emberlink may prefer float64."""
-    more = "learner=mappo", "env.base=[0,15]", "env.map.pixels=8"
-    usual = until(begun("maps", tmp_path / "usual", *more), HORIZON)
-    torch.set_default_dtype(torch.float64)
-    try:
-        other = until(begun("maps", tmp_path / "other", *more), HORIZON)
-        check_env_specs(make_env("maps"))
-    finally:
-        torch.set_default_dtype(torch.float32)
-    assert other.setup.learner.updates > 0
-    weights = other.setup.learner.actor.state_dict()
-    for name, value in usual.setup.learner.actor.state_dict().items():
-        assert weights[name].dtype == value.dtype
-        # TorchRL's coefficients and its estimate of advantages round as the default dtype.
-        torch.testing.assert_close(weights[name], value, rtol=0, atol=1e-6)
