@@ -83,5 +83,9 @@ class WildfireTeamEnv(gymnasium.Env[Any, NDArray[np.float32]]):
         """Draws the environment; see `WildfireParallelEnv.render`."""
         return self._team.render()
 
+    def close(self) -> None:
+        """Closes the window, if there is one."""
+        self._team.close()
+
 
 gymnasium.register(id="emberlink/WildfireTeam-v0", entry_point=f"{__name__}:WildfireTeamEnv")

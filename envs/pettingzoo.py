@@ -38,7 +38,7 @@ def parallel_env(
     Args:
         env: a TorchRL environment of batch size [1] over a `WildfireEnv`, such as
             `emberlink.trainers.make_env` returns; without it, a `WildfireEnv` is made.
-        render_mode: "rgb_array" or None.
+        render_mode: "rgb_array", "human" (a window) or None.
         max_cycles: steps of an episode, instead of the config's horizon.
         kwargs: for `WildfireEnv`, if there is no `env`. Without a `config`, observations are scaled
             (`observation_scale="box"`), and the reward is that of the scenario's configuration.
@@ -74,12 +74,12 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
 
     Args:
         env: see `parallel_env`.
-        render_mode: "rgb_array" or None.
+        render_mode: "rgb_array", "human" or None.
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
         "name": "emberlink_wildfire_v0",
-        "render_modes": ["rgb_array"],
+        "render_modes": ["rgb_array", "human"],
         "render_fps": 20,
         "is_parallelizable": True,
     }
@@ -132,6 +132,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             self._env.set_seed(self._unplayed)
         self._now = self._env.reset(**options)
         self.agents = list(self.possible_agents)
+        self._show()
         infos = self._of(self.agents, self._infos(self._now))
         return self._of(self.agents, self._observations()), infos
 
@@ -157,6 +158,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         failed = self._of(flew, (~after.get(keys.ALIVE)[0]).tolist())
         truncated = bool(after.get("truncated"))
         self.agents = [] if truncated else [agent for agent in flew if not failed[agent]]
+        self._show()
         observations = self._of(flew, self._observations())
         infos = self._of(flew, self._infos(after))
         return observations, rewards, failed, dict.fromkeys(flew, truncated), infos
@@ -190,8 +192,8 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         now = self._begun()
         return {key: int(now.get(key)) for key in (keys.SEEN, keys.BURNING, keys.BURNT)}
 
-    def render(self) -> NDArray[np.uint8]:
-        """Returns a picture of the map, uint8 [height, width, 3].
+    def render(self) -> NDArray[np.uint8] | None:
+        """Returns the picture, uint8 [height, width, 3], or None if it is shown in a window.
 
         Raises:
             UserError: the environment was made without a render mode.
@@ -199,10 +201,28 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         if self.render_mode is None:
             known = self.metadata["render_modes"]
             raise UserError(f"render() needs a render_mode; known: {known}")
-        return self._core.render()
+        picture = self._core.render()
+        if self.render_mode == "rgb_array":
+            return picture
+        from matplotlib import pyplot  # imported here, since it takes a second
+
+        window = pyplot.figure(self._window, clear=True)
+        window.add_axes((0, 0, 1, 1), frame_on=False, xticks=[], yticks=[]).imshow(picture)
+        window.show(warn=False)  # nothing without a display
+        window.canvas.flush_events()
+        return None
 
     def close(self) -> None:
-        """Does nothing; PettingZoo's wrappers call it."""
+        """Closes the window, if there is one."""
+        if self.render_mode == "human":
+            from matplotlib import pyplot
+
+            pyplot.close(self._window)
+
+    @property
+    def _window(self) -> str:
+        """The title of the window, of which each environment has its own."""
+        return f"{self.metadata['name']} {id(self)}"
 
     def _begun(self) -> TensorDictBase:
         """Returns the current time step."""
@@ -214,6 +234,10 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         """Returns the values of some agents, of those of all."""
         every = zip(self.possible_agents, values, strict=True)
         return {agent: value for agent, value in every if agent in agents}
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self.render()
 
     def _stacked(self, actions: dict[str, Array]) -> Array:
         """Returns the actions in the order of the agents, float32 [n, 3]."""
