@@ -288,7 +288,8 @@ class Communication(Transform):
         if self.listens:
             at = (of_steps(steps, key) for key in (keys.POSITION, keys.RNG_KEY, keys.STEP))
             alive = of_steps(steps, keys.ALIVE) if world.failures else None
-            for step, links in zip(steps, self.channel(*at, alive), strict=True):
+            _, hears = self.channel(*at, alive)
+            for step, links in zip(steps, hears, strict=True):
                 left = self.module.budget(step) if self.message_bytes else None
                 step.set(keys.HEARS, links if left is None else links & (left >= 0).unsqueeze(-2))
 

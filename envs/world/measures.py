@@ -1,7 +1,6 @@
 """Measures the sightings of the team and of the base at each step."""
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -267,9 +266,7 @@ class Measures(nn.Module):
         for number, now in enumerate(step):
             looks = View(*(part[number] for part in view))
             flies = None if alive is None else alive[number]
-            place = position[number].double()
-            near = self.channel.in_range(place, flies)
-            links = near, self.channel(place, rng_key, now, flies)
+            links = self.channel(position[number].double(), rng_key, now, flies)
             gone = cell[row // envs == number]
             told.append(self._report(looks, now, links, ignited[number], gone, times))
             known.append(self.base_seen.clone())
@@ -281,7 +278,7 @@ class Measures(nn.Module):
         self,
         view: View,
         step: Tensor,
-        links: Any,
+        links: tuple[Tensor, Tensor],
         ignited: Tensor,
         ended: Tensor,
         times: tuple[Tensor, Tensor | None],

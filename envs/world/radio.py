@@ -46,10 +46,11 @@ class Channel(nn.Module):
 
     def forward(
         self, position: Tensor, rng_key: Tensor, step: Tensor, alive: Tensor | None = None
-    ) -> Tensor:
-        """Returns the links of a step, bool [..., r, r]: row i marks the radios that radio i hears.
+    ) -> tuple[Tensor, Tensor]:
+        """Returns the links of a step without and with losses, bool [..., r, r] each.
 
-        What is sent over a link arrives `delay` steps later.
+        Row i marks the radios in range of radio i, and those that it hears. What is sent over a
+        link arrives `delay` steps later.
 
         Args:
             position: float [..., n, 3], of the UAVs, cells.
@@ -58,27 +59,24 @@ class Channel(nn.Module):
             alive: bool [..., n]; see `in_range`. The base never fails.
         """
         config, places = self.config, self.places(position)
-        linked = self.in_range(position, alive)
+        if alive is not None:
+            alive = nn.functional.pad(alive, (0, len(self.base)), value=True)
+        near = hears = in_range(config, places, alive)
         uses = [(Use.MESSAGE_LOSS, Use.REPORT_LOSS)] * (config.loss > 0)
         uses += [(Use.MESSAGE_FADE, Use.REPORT_FADE)] * config.fade
         units = self._draw(rng_key, step, uses) if uses else []
         if config.loss:
             unit = units[0]
-            linked &= ~(self._spells(unit, step) if config.burst > 1 else unit < config.loss)
+            lost = self._spells(unit, step) if config.burst > 1 else unit < config.loss
+            hears = hears & ~lost
         if config.fade:
-            linked &= units[-1] >= fade(pairwise_distance(places) / config.range)
-        return linked
+            hears = hears & (units[-1] >= fade(pairwise_distance(places) / config.range))
+        return near, hears
 
     def places(self, position: Tensor) -> Tensor:
         """Returns the places of all radios, float [..., r, 3]."""
         base = self.base.to(position.dtype).expand(*position.shape[:-2], -1, -1)
         return torch.cat((position, base), -2)
-
-    def in_range(self, position: Tensor, alive: Tensor | None = None) -> Tensor:
-        """Returns the links of a step if no message is lost, bool [..., r, r]."""
-        if alive is not None:
-            alive = nn.functional.pad(alive, (0, len(self.base)), value=True)
-        return in_range(self.config, self.places(position), alive)
 
     def _draw(self, rng_key: Tensor, step: Tensor, uses: list[tuple[Use, Use]]) -> list[Tensor]:
         """Returns a number from 0 to 1 for each pair and use, float32 [..., r, r] each.

@@ -89,11 +89,13 @@ class TeamMaps(nn.Module):
         cells = torch.cat((cells, self._own), -1)
         in_view = torch.nn.functional.pad(in_view, (0, 1), value=True)
         in_view &= (alive & ~begins.unsqueeze(-1)).unsqueeze(-1)
-        hears = self._hears(tensordict, position, alive)
-        near = self.channel.in_range(position, alive)
-        self.sent = share(
-            self.known, self.exchange, View(cells, in_view, in_view), step, near, hears
-        )
+        if self._messages == "in range":
+            links = self.channel(position, *given, alive)
+        else:
+            every = alive.unsqueeze(-1) & alive.unsqueeze(-2)
+            hears = every & (self._messages == "everyone")
+            links = hears, hears
+        self.sent = share(self.known, self.exchange, View(cells, in_view, in_view), step, *links)
         self.reach.copy_(self.known.reach)
         if self._world.radio.delay and self.exchange is not None:
             self.reach.zero_()
@@ -103,15 +105,6 @@ class TeamMaps(nn.Module):
         """The step of the latest news that each UAV (row) has of another one, [envs, n, n]."""
         uavs = self._world.num_uavs
         return self.known.last_seen[:, :uavs, -uavs:].clamp(min=0)
-
-    def _hears(self, tensordict: TensorDictBase, position: Tensor, alive: Tensor) -> Tensor:
-        """Returns the links of a step, bool [envs, radios, radios]."""
-        if self._messages == "none":
-            return torch.zeros_like(self.reach)
-        if self._messages == "everyone":
-            return alive.unsqueeze(-1) & alive.unsqueeze(-2)
-        given = tensordict.get(keys.RNG_KEY), tensordict.get(keys.STEP)
-        return self.channel(position, *given, alive)
 
     def last_seen(self) -> Tensor:
         """Returns the last step at which each UAV knows each cell seen, float [envs, n, X, Y]."""

@@ -64,7 +64,7 @@ def test_every_step_equals_plain_python(seed, uavs, limit, loss, failures, burn_
         assert not now[keys.REWARD][~alive].any()
         assert not (now[keys.NEW_FIRE] + now[keys.OLD_FIRE] + now[keys.NO_FIRE])[~alive].any()
         time = now[keys.STEP]
-        hears = env._measures.channel(position.double(), now[keys.RNG_KEY], time, alive)
+        _, hears = env._measures.channel(position.double(), now[keys.RNG_KEY], time, alive)
         near = radio.neighbours(torch.cat((position, base), 1), limit)
         lives = torch.nn.functional.pad(alive, (0, 1), value=True)
         assert not (hears & ~(near & lives.unsqueeze(-1) & lives.unsqueeze(-2))).any()

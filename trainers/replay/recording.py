@@ -165,8 +165,7 @@ class Recorder:
         """Returns the views and links of a time step of batch size [1]."""
         position, alive = now.get(keys.POSITION).double(), now.get(keys.ALIVE)
         key, step = now.get(keys.RNG_KEY), now.get(keys.STEP)
-        hears = self._channel(position, key, step, alive)
-        near = self._channel.in_range(position, alive)
+        near, hears = self._channel(position, key, step, alive)
         looks = alive & (step > 0)  # nobody looks at the reset
         view = self._view(position, looks)
         found = {"view": view, "hears": hears, "lost": near & ~hears}
