@@ -37,11 +37,11 @@ MEANING = {
     "action": "displacement along x, y and z in units of env.displacement cells, -1 to 1",
     "next_memory": "memory of the next decision",
 }
-"""what an input or output holds"""
+"""the content of each input and output, by name"""
 
 
 class Decision(nn.Module):
-    """Maps the tensors that a policy reads at a decision to those that it writes."""
+    """Maps the tensors that a policy reads at a decision to the tensors that it writes."""
 
     def __init__(self, policy: TrainedPolicy):
         super().__init__()
@@ -112,7 +112,7 @@ def _dynamic(config: RunConfig, tensor: Tensor) -> dict[int, Any]:
 def card_of(
     policy: TrainedPolicy, decision: Decision, example: tuple[Tensor, ...]
 ) -> dict[str, Any]:
-    """Returns what a user of an exported policy needs to know, as plain values."""
+    """Returns facts for the user of an exported policy, as plain values."""
     config, values = policy.config, flat(to_values(policy.config))
     names = [f"{key}={values[key]}" for key in ("setup", "world")]
     changed = differences(config, resolve(config.method, names))

@@ -64,8 +64,8 @@ def reporter(console: Console) -> Callable[[str, str], None]:
 def print_results(console: Console, results: Results, config: RunConfig, policy: str = "") -> None:
     """Prints means over episodes: a table per fire, a row per policy, a column per measure.
 
-    Measures besides the paper's have a table of their own. `policy` names the learned one, in place
-    of its method.
+    Measures besides the paper's have a second table. `policy` is the name of the learned policy;
+    its method if empty.
     """
     called = policy or config.method
     for fire, by_policy in results.items():

@@ -69,7 +69,7 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
 
 
 def import_files(arguments: Sequence[str], console: Console, output: Path) -> int:
-    """Reads files of fires, prints what was understood of each, and writes them to a bank.
+    """Reads files of fires, prints its reading of each, and writes them to a bank.
 
     A bank is an .npy of steps, float32 [fires, X, Y], inf for never, with a .json of its facts.
     """

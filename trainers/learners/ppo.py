@@ -150,7 +150,7 @@ class PPO(Learner, ABC):
         weights = [*self.parts[0], *self.parts[1]]
         self.optimizer = torch.optim.Adam(weights, lr=config.lr, eps=1e-5, fused=True)
         self.learning_starts = context.horizon
-        # Several decisions at once cost less; those of an episode would fill the memory twice.
+        # Several decisions at once cost less; a whole episode would fill the memory twice.
         self.rollout_steps = max(n for n in range(1, 11) if context.horizon % n == 0)
         self.recent = []  # transitions of the current episode
 

@@ -119,9 +119,9 @@ class Episode:
 class Recorder:
     """Records the episode of one environment; `add` is called at each step.
 
-    It repeats what the environment computes and does not show: views and links. `member` is the
-    index of the environment; `advised` tells whether the policy reads what the communication tells
-    it, and `hears` whether it receives messages of its own.
+    It computes views and links again, which the environment does not show. `member` is the index of
+    the environment; `advised` tells whether the policy reads the advice of the communication, and
+    `hears` whether it receives messages by itself.
     """
 
     def __init__(self, *, member: int = 0, advised: bool = True, hears: bool = False):

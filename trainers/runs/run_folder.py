@@ -59,7 +59,7 @@ class RunFolder:
     def create(cls, config: RunConfig, name: str = "", *, label: str = "") -> "RunFolder":
         """Creates a new run folder in `config.output`, with config.yaml and the fires of files.
 
-        It is called `name`, or after the time, the settings and `label` in place of the method.
+        Its name is `name`, or else made of the time, `label` or the method, and the settings.
         """
         about = f"{label or config.method}_{config.setup}_{config.world}_s{config.seed}"
         name = name or f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{about}"
@@ -89,7 +89,7 @@ class RunFolder:
     def config(self, file: Path | None = None, **changes: Any) -> RunConfig:
         """Returns the configuration that a checkpoint was trained with, with changed values.
 
-        Without `file` it is that of the newest or, before there is one, of config.yaml.
+        Without `file`, the newest checkpoint is read or, before there is one, config.yaml.
         """
         file = self.newest if file is None and self.newest.exists() else file
         given = checkpoint.read_header(file).config if file else self.values()

@@ -35,7 +35,7 @@ def tune(
 
     Args:
         space: a file with the settings to try; the learner's file of configs/space if None.
-        trials: number of trials, those of earlier commands included.
+        trials: number of trials, with the trials of earlier commands.
     """
     require("optuna", "tune", "tune")
     import optuna
@@ -119,7 +119,7 @@ def _distribution(key: str, values: Any) -> Any:
 
 
 def _trainer(trial: Any, method: str, overrides: Sequence[str]) -> Trainer:
-    """Returns the training of a trial: a new one, or the one that was interrupted."""
+    """Returns the training of a trial, new or resumed after an interruption."""
     if run := trial.user_attrs.get(_RUN):
         return resume(run)
     trainer = Trainer(resolve(method, overrides))
