@@ -17,8 +17,8 @@ from emberlink.envs.world.sensor import Sensor
 class BeliefMaps(nn.Module):
     """Keeps what each UAV knows of the fire and of the places of UAVs.
 
-    A UAV enters what its camera shows and where it is; what it knows from others is entered by the
-    communication method. It observes its altitude, the time and pictures of its map (`Crops`).
+    A UAV enters the view of its camera and its position; the communication method enters the
+    messages of others. It observes its altitude, the time and pictures of its map (`Crops`).
 
     Args:
         world: the environment's constants.
@@ -96,7 +96,7 @@ class BeliefMaps(nn.Module):
     def look(self, tensordict: TensorDictBase) -> None:
         """Adds each UAV's view and position to its map, and writes the vector that it observes."""
         position, step = tensordict.get(keys.POSITION), tensordict.get(keys.STEP)
-        # A UAV sees its own position, too: an entry behind the cells.
+        # A UAV's own position is an entry behind the cells.
         alive = tensordict.get(keys.ALIVE).unsqueeze(-1).byte()
         sight = torch.cat((tensordict.get(keys.SIGHT).flatten(-2), alive), -1)
         cells = self.sensor.look(position.double(), self._start)[1]
@@ -125,7 +125,7 @@ class BeliefMaps(nn.Module):
         return 4 * step.clamp(max=latest).view(-1, 1, 1)
 
     def show(self, tensordict: TensorDictBase, due: Tensor) -> None:
-        """Writes the pictures; draws those of the environments of a mask, bool [envs]."""
+        """Writes the pictures; redraws the environments of a mask, bool [envs]."""
         env = due.nonzero().squeeze(-1)
         if len(env):
             self.crops[env] = self._draw(tensordict, env)

@@ -40,7 +40,7 @@ class CommModule(TensorDictModuleBase):
     checkpoint and must hold finite numbers. Constants are registered with `persistent=False`.
 
     If `hears` is true, the links of each step, by the radio of the world (`env.radio`), are written
-    under `keys.HEARS` before `shaping` and `forward` are called. What is sent over them arrives
+    under `keys.HEARS` before `shaping` and `forward` are called. Messages over them arrive
     `env.radio.delay` steps later (`radio.Late`).
 
     Args:

@@ -226,7 +226,7 @@ class Consensus(CommModule):
         """Passes on records of discoverers, one link a step.
 
         A discoverer says its own record. Other UAVs pass on the newer records that they received
-        at the step before, those of the highest rank first.
+        at the step before, by falling rank.
 
         Returns:
             The discoverers of whom each UAV receives a newer record, bool [steps, num_envs, n, n];

@@ -32,7 +32,7 @@ class MapsConfig:
 
 
 class Maps(CommModule):
-    """Passes on what the UAVs' belief maps hold.
+    """Passes on the entries of the UAVs' belief maps.
 
     At each step, a UAV sends the cells and the positions of UAVs that are new to a UAV in range;
     received messages are passed on at the next step (`Exchange`).

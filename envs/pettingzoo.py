@@ -221,7 +221,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
 
     @property
     def _window(self) -> str:
-        """The title of the window, of which each environment has its own."""
+        """The title of the window, unique to the environment."""
         return f"{self.metadata['name']} {id(self)}"
 
     def _begun(self) -> TensorDictBase:
@@ -231,7 +231,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         return self._now
 
     def _of(self, agents: list[str], values: Iterable[Any]) -> dict[str, Any]:
-        """Returns the values of some agents, of those of all."""
+        """Picks the values of some agents from the values of all."""
         every = zip(self.possible_agents, values, strict=True)
         return {agent: value for agent, value in every if agent in agents}
 

@@ -284,7 +284,8 @@ class WildfireEnv(EnvBase):
     ) -> None:
         """Calls `steer` on the action before every step, and `communicate` on time steps.
 
-        It returns the last one, and what it has changed in all, [steps, num_envs, ...].
+        `communicate` returns the last time step, and the tensors that it changed in all of them,
+        [steps, num_envs, ...].
         """
         self._steer, self._communicate = steer, communicate
 

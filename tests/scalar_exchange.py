@@ -90,7 +90,7 @@ class ScalarExchange:
         return spent + sum(self.sizes[entry] for entry in said)
 
     def _offers(self, i: int, step: int) -> list:
-        """Returns the entries that radios in range may lack, with what they are sorted by."""
+        """Returns the entries that radios in range may lack, with their sort keys."""
         told, contact = self.told[i], [j for j, at in self.heard[i].items() if step - at < 10]
         offered = []
         for entry, look in self.known[i].items():

@@ -101,7 +101,7 @@ def resume(
         run: the run, or its folder.
         progress, evaluate_after: see `train`.
         settings: settings that do not affect learning: `episodes`, `device`, `logger`,
-            `checkpoint_interval`, `checkpoint_steps`, and those of `evaluation`.
+            `checkpoint_interval`, `checkpoint_steps`, and `evaluation.*`.
 
     Raises:
         UserError: the run cannot be resumed, or a file cannot be written.

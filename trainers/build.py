@@ -90,7 +90,7 @@ def build_env(
 
 
 def empty_env(config: RunConfig, num_envs: int = 1) -> TransformedEnv:
-    """Returns environments of a configuration without fire, for what a policy reads."""
+    """Returns environments of a configuration without fire, for the specs of a policy."""
     fire = torch.full(config.env.grid, torch.inf)
     return build_env(config, num_envs=num_envs, fire=fire, seed=0, device=config.device)
 

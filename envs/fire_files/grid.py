@@ -72,7 +72,7 @@ class Fire:
     """True for a map of the whole grid, which is neither cropped nor burnt out"""
 
     def bounds(self, until: float | None) -> Bounds:
-        """Returns the bounds of the area burnt by a time; None for those of the file."""
+        """Returns the bounds of the area burnt by a time; None for the whole file."""
         raise NotImplementedError
 
     def on(self, window: Window, until: float, report: Report) -> np.ndarray:

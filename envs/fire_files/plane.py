@@ -26,7 +26,7 @@ class Plane(NamedTuple):
         return axes[0].unit_conversion_factor if axes else None
 
     def project(self, x: Any, y: Any, *, back: bool = False) -> tuple[Any, Any]:
-        """Returns coordinates of the file on the plane, or those of the plane in the file."""
+        """Projects coordinates of the file onto the plane, or back."""
         if self.target is None:
             return x, y
         ends = (self.target, self.source) if back else (self.source, self.target)

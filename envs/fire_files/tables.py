@@ -1,4 +1,4 @@
-"""Reads the features of vector files, and chooses those of one fire.
+"""Reads the features of vector files, and chooses the features of one fire.
 
 GeoPackage, shapefile, GeoJSON, KML, CSV and folders of them become one table of geopandas, with its
 attributes as texts, empty where they are missing.
@@ -152,7 +152,7 @@ def _kml(path: Path, kind: str, layer: str | None) -> Any:
 def _placemarks(
     element: Any, folders: tuple[str, ...] = (), time: str | None = None
 ) -> Iterator[tuple[dict[str, str | None], Any]]:
-    """Yields each placemark and its attributes; a folder's time holds for what is in it."""
+    """Yields each placemark and its attributes; a folder's time holds for its contents."""
     for part in element:
         if part.tag in ("TimeStamp", "TimeSpan"):
             time = part.findtext("when") or part.findtext("begin") or time
@@ -185,7 +185,7 @@ def _texts(column: Any) -> Any:
 
 
 def attributes(frame: Any) -> list[Any]:
-    """Returns the columns of a table without that of the geometry."""
+    """Returns the columns of a table except its geometry."""
     return [name for name in frame.columns if name != frame.geometry.name]
 
 

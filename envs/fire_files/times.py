@@ -118,7 +118,7 @@ def read_times(
 
 
 def _columns(frame: Any, given: str | Sequence[str] | None, outside: Sequence[str]) -> list[Any]:
-    """Returns the columns of `fire.time_field`, or the one with a known name; asks if unsure."""
+    """Returns the columns of `fire.time_field`, or the column with a known name; asks if unsure."""
     if given is not None:
         given = (given,) if isinstance(given, str) else given
         return [column_named(name, frame, "fire.time_field") for name in given]

@@ -145,7 +145,7 @@ class Look(NamedTuple):
     counts: Tensor
     """float64 [steps, envs, uavs, 3]: cells in view by class, new fire as new to the team"""
     shown: Sighting
-    """what is shown to the UAVs; with `own`, new fire is what is new to the UAV"""
+    """the sightings shown to the UAVs; with `own`, new fire is fire new to the UAV"""
     view: View
     """the indices of the cells"""
     seen: Tensor

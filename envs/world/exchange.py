@@ -225,10 +225,10 @@ class Exchange(nn.Module):
         return ((mine >> 1) // self.unit - before).clamp(0, OLD)
 
     def _fits(self, entry: Tensor, gain: Tensor, size: Tensor, left: Tensor) -> Tensor:
-        """Returns which entries are said: those of the highest gain that fit together, bool [k].
+        """Returns which entries are said: by falling gain, as many as fit, bool [k].
 
-        Of equal gain, those that a radio says first depend on its number, so that radios say
-        different ones.
+        The order of equal gains depends on the radio's number, so that radios say different
+        entries.
         """
         radios, items = self.shape[1:]
         row, most = entry // items, radios * OLD
@@ -252,7 +252,7 @@ class Exchange(nn.Module):
         code, last, seen = code[which], known.last_seen, known.seen_fire
         changed = told_again = newer(code, codes(known, target))
         if self.free:
-            # Nor need it be passed on to those in range of a hearer who have all heard it, too.
+            # Nor is an entry passed on if all radios in range of the hearer have heard it.
             missed = ~arrives & ~torch.eye(radios, dtype=torch.bool, device=arrives.device)
             relays = (self.contact.float() @ missed.float()) > 0  # [envs, hearers, speakers]
             told_again = changed & relays.take(link)

@@ -99,7 +99,7 @@ class SightingAges(nn.Module):
         env = cell // self.since.shape[1]
         row = place % steps * envs + env
         look = now[row] if looks is None else looks.view(-1)[cell].long()
-        # What a look or an end follows: the look before, among these steps or earlier ones.
+        # The look before a look or an end, among these steps or earlier ones.
         before = self.since.view(-1)[cell].long()
         again = cell[1:] == cell[:-1]
         before[1:] = torch.where(again, look[:-1], before[1:])

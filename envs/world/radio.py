@@ -49,8 +49,8 @@ class Channel(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Returns the links of a step without and with losses, bool [..., r, r] each.
 
-        Row i marks the radios in range of radio i, and those that it hears. What is sent over a
-        link arrives `delay` steps later.
+        Row i marks the radios in range of radio i, and the radios that it hears. A message arrives
+        `delay` steps later.
 
         Args:
             position: float [..., n, 3], of the UAVs, cells.
@@ -118,8 +118,8 @@ class Late(nn.Module):
     Args:
         delay: steps from sending to receiving.
         envs: number of environments.
-        blank: what arrives before step `delay`; of the data type of what is sent.
-        shape: of what an environment sends at a step.
+        blank: the message that arrives before step `delay`; has the data type of messages.
+        shape: of an environment's messages of a step.
     """
 
     sent: Tensor

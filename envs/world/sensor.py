@@ -106,7 +106,7 @@ class Sensor(nn.Module):
             position: float64 [..., n, 3], within the grid, cells.
             start: int64, broadcast against [..., n]: index of the first cell of each UAV's map.
             rng_key, step: int64 [...], `keys.RNG_KEY` and the step since the episode began, which
-                determine what is recognised; everything if None.
+                determine the recognised cells; None: all cells are recognised.
 
         Returns:
             centre: float64 [..., n, 2], the (i, j) of the cell nearest to the UAV.

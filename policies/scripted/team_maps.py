@@ -85,7 +85,7 @@ class TeamMaps(nn.Module):
         alive = tensordict.get(keys.ALIVE)
         given = tensordict.get(keys.RNG_KEY), step
         _, cells, in_view = self._sensor.look(position, self._start, *given)
-        # A UAV sees itself, too: an entry behind the cells.
+        # A UAV's own position is an entry behind the cells.
         cells = torch.cat((cells, self._own), -1)
         in_view = torch.nn.functional.pad(in_view, (0, 1), value=True)
         in_view &= (alive & ~begins.unsqueeze(-1)).unsqueeze(-1)

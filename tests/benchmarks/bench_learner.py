@@ -1,4 +1,4 @@
-"""Measures what a training spends on updates and on everything else, in CPU seconds of one run."""
+"""Measures the CPU seconds of a training: its updates, and everything else."""
 
 import time
 from typing import Any

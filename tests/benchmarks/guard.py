@@ -3,9 +3,9 @@
     python tests/benchmarks/guard.py            # compare with guard.json; takes some seconds
     python tests/benchmarks/guard.py --record   # after an intended change
 
-A ratio is the time of a unit of our work over that of a loop of plain torch calls. The loop is
-of the same kind as the work (many small calls; gathers in large tensors; matrix products), so that
-a faster or a busy machine affects both.
+A ratio is the time of a unit of our work divided by the time of a loop of plain torch calls. The
+loop is of the same kind as the work (many small calls; gathers in large tensors; matrix products),
+so that a faster or a busy machine affects both.
 """
 
 import json

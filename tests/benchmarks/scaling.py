@@ -2,8 +2,8 @@
 
     python tests/benchmarks/scaling.py [FIGURE.png]
 
-On each axis the other values are those of the paper: 30 x 30 cells, 6 UAVs; 256 environments if
-their number is not the axis. Prints a Markdown table of UAV-steps per second.
+The axes that are not measured keep the paper's values, 30 x 30 cells and 6 UAVs, and 256
+environments. Prints a Markdown table of UAV-steps per second.
 """
 
 import sys

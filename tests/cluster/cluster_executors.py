@@ -1,6 +1,6 @@
 """Tests sweeps on submitit, SLURM and Ray, with interruptions; `make test-cluster` runs them.
 
-Each sweep trains three runs, whose files must be those of the local executor, byte for byte.
+Each sweep trains three runs, whose files must equal the local executor's byte for byte.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""Tests what UAVs recognise (`env.sensor`), and what is new to them (`env.knowledge`)."""
+"""Tests which cells UAVs recognise (`env.sensor`), and which fire is new (`env.knowledge`)."""
 
 import itertools
 import math

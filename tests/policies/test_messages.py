@@ -48,7 +48,7 @@ class Twin:
 
     Args:
         net: the network.
-        kept: rounding errors of an earlier pass, which are added in place of rounding.
+        kept: rounding errors of an earlier pass, added instead of rounding anew.
     """
 
     def __init__(self, net: Any, kept: list[torch.Tensor] | None = None):

@@ -1,4 +1,4 @@
-"""Tests policies that emberlink has not trained, and those that it exports."""
+"""Tests policies that emberlink has not trained, and exported policies."""
 
 import json
 import warnings

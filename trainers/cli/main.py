@@ -64,7 +64,7 @@ def _run(words: list[str]) -> int:
             raise
         return _report(program, f"{error.filename or 'a file'}: {error.strerror}")
     except RuntimeError as error:
-        # PyTorch has no error of its own for memory of the CPU.
+        # PyTorch has no error class for memory of the CPU.
         if "DefaultCPUAllocator" in str(error) or type(error).__name__ == "OutOfMemoryError":
             return _report(program, f"not enough memory: {str(error).splitlines()[0]}")
         raise

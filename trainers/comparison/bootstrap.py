@@ -40,7 +40,7 @@ def iqm(values: Values, axis: int = -1) -> Any:
 
 
 def iqm_difference(first: Values, second: Values, axis: int = -1) -> Any:
-    """Returns the interquartile mean of `first` minus that of `second`."""
+    """Returns the difference of two interquartile means."""
     return iqm(first, axis) - iqm(second, axis)
 
 

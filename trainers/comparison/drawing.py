@@ -54,8 +54,8 @@ def training(
 ) -> Figure:
     """Returns training curves: the interquartile mean over seeds and its interval for each label.
 
-    Each measure has a panel, with the results of scripted policies on the fires trained on. Colours
-    are those of `labels` in `frozen`.
+    Each measure has a panel, with the results of scripted policies on the fires trained on. Labels
+    have the colours of `frozen`.
     """
     has_curve = set(curves["label"])
     colours = {label: colour for label, colour in _colours(labels).items() if label in has_curve}

@@ -91,7 +91,7 @@ class Run:
 def read_all(
     paths: Sequence[Path | str], labels: Sequence[str] = ()
 ) -> tuple[list[Run], list[LeftOut]]:
-    """Returns the finished runs of paths, one entry per evaluation, and what is left out."""
+    """Returns the finished runs of paths, one entry per evaluation, and the runs left out."""
     if labels and len(labels) != len(paths):
         raise UserError(f"{len(labels)} labels for {len(paths)} paths: one each")
     folders: dict[Path, tuple[Path, str]] = {}

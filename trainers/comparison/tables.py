@@ -33,7 +33,7 @@ Frame = Any
 
 
 def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
-    """Returns one row per evaluation of a run, by section, label and seed, and what is left out.
+    """Returns one row per evaluation of a run, by section, label and seed, and the runs left out.
 
     Of several runs of a label with one seed, the last by name is used, and a copy of the package's
     policy only if there is no other. Runs that were evaluated on other fires than the first of
@@ -150,7 +150,7 @@ def radio_text(settings: Mapping[str, Any]) -> str:
 
 
 def _same_fires(first: Run, other: Run) -> bool:
-    """Returns whether two evaluations are of the same fires, as far as both describe them."""
+    """Returns whether two evaluations are of the same fires, by the values that both hold."""
     one, two = (flat(run.evaluation.held_out) for run in (first, other))
     same = all(two[key] == value for key, value in one.items() if key in two)
     return same and first.evaluation.results.keys() == other.evaluation.results.keys()

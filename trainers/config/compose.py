@@ -69,7 +69,7 @@ def in_world(config: RunConfig, world: str, **fire: Any) -> RunConfig:
     there = resolve(config.method, [setup, f"world={world}"], **fire)
     here = [resolve(config.method, [setup, f"world={config.world}", "fire=paper"])]
     if here[0].edition != config.edition:
-        # The file of the run's edition is gone: what the other world itself sets is taken, too.
+        # The file of the run's edition is gone: settings of the other world's own file also count.
         here.append(resolve(config.method, [setup, "world=paper", "fire=paper"]))
     origins = [flat(to_values(origin)) for origin in here]
     values = to_values(config)

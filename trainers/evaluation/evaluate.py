@@ -43,8 +43,8 @@ BLOCK = 50
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Watch = Callable[[WildfireEnv, TensorDictBase], None]
-"""called at each step, from 0 to the horizon with the environments and what they returned: the
-result of the reset, or the "next" of the step"""
+"""called at each step, from 0 to the horizon, with the environments and their output: the result
+of the reset, or the "next" of the step"""
 
 
 class NonFiniteActionError(UserError):
@@ -236,7 +236,7 @@ def source_digest() -> str:
 def scripted_config(config: RunConfig, name: str) -> RunConfig:
     """Returns the configuration of the environment of a scripted policy.
 
-    It is that of the run, with two exceptions. A policy that needs the communication of another
+    It is the run's, with two exceptions. A policy that needs the communication of another
     method has its settings in the run's setup. Where the run's communication would replace actions
     of the policy, there is none.
     """

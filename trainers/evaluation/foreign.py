@@ -124,7 +124,7 @@ class OnnxPolicy:
         options.intra_op_num_threads = torch.get_num_threads()
         try:
             self.session = onnxruntime.InferenceSession(str(file), options)
-        except Exception as error:  # onnxruntime has a class of its own for each
+        except Exception as error:  # onnxruntime's errors share no class
             raise UserError(f"{file}: {' '.join(str(error).split())[:300]}") from None
         self.inputs = {one.name: one for one in self.session.get_inputs()}
         self.outputs = [one.name for one in self.session.get_outputs()]

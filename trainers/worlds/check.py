@@ -57,7 +57,7 @@ def conditions(means: Means, headline: str) -> list[Condition]:
     """Returns the conditions of a world.
 
     Of the policies that know the fire (`oracle…`), that merge all maps (`…_all`) or none
-    (`…_alone`), the best one counts: in a world with a base, those that report to it.
+    (`…_alone`), the best one counts; in a world with a base, the best one that reports to it.
 
     Args:
         means: the measures of at least the four needed policies.

@@ -63,7 +63,7 @@ def test_a_wrong_name_or_value_is_answered_without_torch(wrong, seconds):
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     status, spent = done.stdout.split()
     assert status == "2", done.stderr
-    assert float(spent) < 2 * seconds  # machines that test are slower than those of users
+    assert float(spent) < 2 * seconds  # test machines are slower than users' machines
 
 
 def test_invalid_run_folders(run, tmp_path, capsys):

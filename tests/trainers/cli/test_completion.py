@@ -11,7 +11,7 @@ PROGRAM = "import sys; from emberlink.trainers.cli.main import main; sys.exit(ma
 
 
 def completed(line: str, folder: Path) -> list[str]:
-    """Returns what the last word of a line may become, asked as a shell's script does."""
+    """Returns the completions of a line's last word, asked as a shell's script does."""
     written = folder / "words"
     line = f"emberlink {line}"
     asked = {

@@ -44,7 +44,7 @@ def test_networks_evaluated_with_other_radios(tmp_path):
 
 
 def test_networks_trained_with_other_radios(tmp_path):
-    """The interval is over seeds, too; there is none with one seed."""
+    """The interval is over seeds and fires; one seed has none."""
     for override, coverage in (("", 60.0), (OFF, 50.0), (FULL, 70.0)):
         for seed in range(2):
             overrides = (override, "checkpoint_interval=9") if override else ()

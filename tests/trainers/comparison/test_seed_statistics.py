@@ -86,7 +86,7 @@ def test_interval_of_a_difference_is_over_the_seeds_of_both():
     first, second = [1.0, 3.0, 8.0], [2.0, 6.0]
     got = interval(iqm_difference, first, second)
     # There are 27 means of the first and 4 of the second. Of the 108 differences, the least are -5,
-    # once, and 5/3 - 6, three times. These 4 are 3.7 % of all, so that the 2.5 % end at the latter.
+    # once, and 5/3 - 6, three times. These 4 are 3.7 % of all, so the 2.5 % quantile is 5/3 - 6.
     assert got == pytest.approx((5 / 3 - 6, 19 / 3 - 2), abs=1e-9)
     assert interval(iqm_difference, first, second) == got
     assert interval(iqm_difference, first, [2.0]) is None

@@ -67,13 +67,13 @@ COMM = {name: TypeAdapter(MODULES.find(name).config_type).json_schema() for name
 
 
 def entered(schema: dict, root: dict) -> dict:
-    """Resolves a reference to its schema; for a scenario that of the generator."""
+    """Resolves a reference to its schema; a scenario's is the generator's."""
     schema = schema.get("oneOf", [schema])[0]
     return root["$defs"][schema["$ref"].rsplit("/", 1)[-1]] if "$ref" in schema else schema
 
 
 def leaves(schema: dict, root: dict, prefix: str = "") -> Iterator[tuple[str, dict]]:
-    """Yields every leaf key with its schema, except those of `comm` and `learner`."""
+    """Yields every leaf key with its schema, except `comm.*` and `learner.*`."""
     for name, below in schema["properties"].items():
         below = entered(below, root)
         if "properties" in below:
@@ -86,7 +86,7 @@ LEARNER = TypeAdapter(DDPGConfig).json_schema()
 LEARNER["properties"].pop("name")
 KEYS = dict(leaves(SCHEMA, SCHEMA)) | dict(leaves(LEARNER, LEARNER, "learner."))
 REACTION = dict(leaves(SCHEMA["$defs"]["ReactionConfig"], SCHEMA, "fire."))
-del REACTION["fire.kind"]  # without it, the keys are those of the level set
+del REACTION["fire.kind"]  # without it, the keys are the level set's
 COMM_KEYS = {
     name: {
         f"comm.{key}": below for key, below in leaves({"properties": {}, **below_root}, below_root)

@@ -1,4 +1,4 @@
-"""Tests evaluations of a run in another world than that of its training."""
+"""Tests evaluations of a run in a world that it was not trained in."""
 
 import json
 import warnings
@@ -39,7 +39,7 @@ def test_settings_of_the_run_are_kept_unless_the_worlds_differ_in_them():
     run = resolve("consensus", ["setup=tuned", "world=front", *own])
     moved = in_world(run, "swarm").env
     assert (moved.view_angle, moved.radio.loss, moved.altitude) == (40, 0.5, (1, 3))
-    assert (moved.num_uavs, moved.grid) == (24, (100, 100))  # those of swarm
+    assert (moved.num_uavs, moved.grid) == (24, (100, 100))  # swarm's values
     assert in_world(run, "relay").env.num_uavs == 4  # front and relay have six
     assert in_world(run, "relay").env.base == (0, 30)
     assert in_world(in_world(run, "relay"), "front").env.base is None

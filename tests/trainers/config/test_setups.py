@@ -93,7 +93,7 @@ OWN = {
         "learner.buffer_size": 50_000,
     },
 }
-"""what distinguishes a method from shared_memory, beside its communication"""
+"""settings that distinguish a method from shared_memory, beside its communication"""
 OF_SETUP = {
     RELEASED: {"independent": {"learner.gamma": 0.92}},
     "tuned": {
@@ -103,7 +103,7 @@ OF_SETUP = {
         "maps": {**PRICE, **NOISE, "policy.hold": 10},
     },
 }
-"""what a setup adds to that"""
+"""settings that a setup adds to `OWN`"""
 
 
 @pytest.mark.parametrize("setup", [PAPER, RELEASED, "tuned"])

@@ -1,4 +1,4 @@
-"""Tests what a replay holds: its numbers, its size, its text and its files."""
+"""Tests the contents of a replay: numbers, size, text and files."""
 
 import json
 import math

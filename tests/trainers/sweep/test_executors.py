@@ -1,4 +1,4 @@
-"""Tests the executors as far as they need no cluster; tests/cluster has the rest."""
+"""Tests the executors without a cluster; tests/cluster has the rest."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Tests emberlink sweep: every combination is trained once, and repeating it does what is left."""
+"""Tests emberlink sweep: every combination is trained once, and repeating it trains the rest."""
 
 import os
 import re
@@ -60,7 +60,7 @@ def finish(run: RunFolder) -> None:
 
 
 class Instant(Executor):
-    """Finishes each task at its second poll; the contract of an executor of one's own."""
+    """Finishes each task at its second poll; the contract of a user's executor."""
 
     workers = 2
 

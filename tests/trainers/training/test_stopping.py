@@ -14,7 +14,7 @@ SOAK = Path(__file__).parents[2] / "soak" / "soak.py"
 
 @pytest.mark.heavy
 def test_every_trial_succeeds(tmp_path):
-    """Forks in a process of its own, which has no threads."""
+    """Forks in a separate process, which has no threads."""
     done = subprocess.run(
         [sys.executable, str(SOAK), "--counts", json.dumps(COUNTS)],
         capture_output=True,
