@@ -23,13 +23,14 @@ FIGURE = re.compile(r"!\[[^\]]*\]\(([^)]+)\)")
 BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
 
 
-def test_architecture_names_every_room_and_nothing_else():
+def test_architecture_names_every_room_and_file_and_nothing_else():
     text = TEXTS[ROOT / "docs" / "architecture.md"]
     for path in re.findall(rf"`((?:{'|'.join(ROOMS)})/[\w/.]*)`", text):
         assert (ROOT / path).exists(), path
     rooms = {file.parent for room in ROOMS for file in (ROOT / room).rglob("__init__.py")}
-    names = {room.relative_to(ROOT).as_posix() for room in rooms}
-    assert {name for name in names if f"{name}/" not in text} == set()
+    names = {f"{room.relative_to(ROOT).as_posix()}/" for room in rooms}
+    names |= {file.name for room in rooms for file in room.glob("*.py") if file.name[:2] != "__"}
+    assert {name for name in names if name not in text} == set()
 
 
 def test_the_version_the_licence_and_the_date_agree():
