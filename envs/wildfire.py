@@ -117,7 +117,7 @@ class WildfireEnv(EnvBase):
         self._fire_name = fire if isinstance(fire, str) else getattr(fire, "name", None)
         self._make_world(fire)
         self._make_specs()
-        self.to(self.device)
+        torch.nn.Module.to(self, self.device)  # EnvBase.to does nothing for its own device
         self._seeded = seed is not None
         if seed is not None:
             seeds = counter_rng.check_seeds(seed, num_envs)

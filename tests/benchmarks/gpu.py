@@ -2,8 +2,9 @@
 
     python tests/benchmarks/gpu.py [DEVICE] [EPISODES]
 
-Takes about ten minutes with the defaults, cuda and 20 episodes. With cpu as DEVICE, it checks
-itself: all results agree. Ratios are the CPU's wall time, with all its threads, over the device's.
+Takes three minutes on an H200 with the defaults, cuda and 20 episodes. With cpu as DEVICE, it
+checks itself: all results agree. Ratios are the CPU's wall time, with all its
+threads, over the device's.
 """
 
 import sys

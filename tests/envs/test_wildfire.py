@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs, step_mdp
 
-from emberlink.envs import WildfireConfig, WildfireEnv, keys
+from emberlink.envs import WildfireConfig, WildfireEnv, keys, wildfire
 from emberlink.envs.fire.generator import load_scenario, make_fires
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import make_env
@@ -159,3 +159,11 @@ def test_bad_input_is_named(message):
 def test_start_positions_outside_the_box_are_named(position):
     with pytest.raises(UserError, match="position"):
         start(world(), *position)
+
+
+def test_the_state_is_on_the_device(monkeypatch):
+    """Every machine has "meta", a device without numbers, on which specs can't be made."""
+    monkeypatch.setattr(wildfire, "check_device", lambda name: None)
+    monkeypatch.setattr(WildfireEnv, "_make_specs", lambda env: None)
+    env = WildfireEnv(2, WildfireConfig(grid=(12, 12)), EVERYWHERE, seed=0, device="meta")
+    assert {buffer.device.type for buffer in env.buffers()} == {"meta"}

@@ -63,8 +63,7 @@ class Teacher(Transform):
         hold: steps for which an action is held.
 
     Raises:
-        UserError: the UAVs have no maps, there is no such teacher, or the environment is on a
-            GPU.
+        UserError: the UAVs have no maps, or there is no such teacher.
     """
 
     target: Tensor
@@ -77,8 +76,6 @@ class Teacher(Transform):
                 f"env.observation={env.config.observation}: the teacher of learner=imitation flies "
                 "by the UAVs' maps, which they have with env.observation=map"
             )
-        if torch.device(env.device or "cpu").type != "cpu":
-            raise UserError(f"device={env.device}: the teacher needs device=cpu")
         policy = find(name)(env, KnownMaps(maps))
         policy.stride *= hold
         policy.period = hold if hold > 1 else policy.period
