@@ -1,11 +1,12 @@
-"""Measures what messages are worth over delay, loss and bytes: a file of lines, and its figure.
+"""Measures what messages are worth over delay, loss and bytes, and draws it.
 
-    python docs/experiments/surface.py surface.jsonl surface.png POLICY... [key=value ...]
+    python docs/experiments/surface.py NAME POLICY... [key=value ...]
 
-A POLICY is a run, `pretrained:METHOD`, or the name of a scripted policy, played with the keys of
-a `world=`. Each plays frozen, on the same test fires, with the radio off and with each radio. The
-file gets a line for each; what is in it is not played again. The figure shows the gain over the
-radio off in the headline; where its 95 % interval, paired by fire, reaches 0, it is in brackets.
+A POLICY is a run, `pretrained:METHOD`, or the name of a scripted policy. Each plays frozen, in the
+world of `key=value`, on the same test fires with each radio, with the radio off and without limits.
+NAME.jsonl gets a line for each; what is in it is not played again. NAME.png is drawn at the end or
+at Ctrl-C, and without a POLICY from the lines that are there. It shows the gain of messages in the
+headline and, below, their value (docs/comparison.md), with 95 % intervals over fires.
 """
 
 import json
@@ -14,68 +15,90 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-import yaml
+import torch
 from matplotlib.figure import Figure
 
-from emberlink import trainers
+from emberlink.envs.scenarios import fires_of
 from emberlink.policies.scripted.base import SCRIPTED
-from emberlink.trainers.comparison import bootstrap
-from emberlink.trainers.worlds.check import played, world_config
+from emberlink.trainers.comparison.communication import gain_and_value
+from emberlink.trainers.evaluation.evaluate import play_learned, play_scripted
+from emberlink.trainers.evaluation.policy import load_policy
+from emberlink.trainers.runs.pretrained import read_run
+from emberlink.trainers.worlds.check import world_config
 
-DELAYS, LOSSES, BYTES = (0, 1, 5, 20, 50), (0.0, 0.2, 0.5, 0.8), (8, 16, 64, None)
-FIRES = 50
-lines, figure, *more = sys.argv[1:]
-policies = [word for word in more if "=" not in word]
-changes = [word for word in more if "=" in word]
-OFF = {"env.radio.range": 0}
-
-
-def measured(policy: str, radio: dict) -> list[float]:
-    """Returns the headline of each episode, in the world of `changes`."""
-    given = [f"{key}={'null' if value is None else value}" for key, value in radio.items()]
-    config = world_config([*changes, *given])
-    headline = config.evaluation.headline
-    if policy in SCRIPTED.known():
-        return played(config, policy, fires=FIRES, split="test")[headline]
-    given = (word.partition("=") for word in changes)
-    world = {key: yaml.safe_load(value) for key, _, value in given}
-    results = trainers.evaluate(policy, episodes=FIRES, scripted=False, **world, **radio)
-    return list(next(iter(results.values()))["learned"][headline])
-
-
-def gain(off: np.ndarray, on: np.ndarray, axis: int = -1):
-    return on.mean(axis) - off.mean(axis)
-
-
-path = Path(lines)
-known = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-found = {(x["policy"], json.dumps(x["radio"])): x["values"] for x in known}
-radios = [
-    {"env.radio.delay": delay, "env.radio.loss": loss, "env.radio.bandwidth": most}
-    for delay, loss, most in product(DELAYS, LOSSES, BYTES)
+FIRES = 20
+DELAYS, LOSSES, BYTES = (0, 1, 5, 20, 50), (0.0, 0.2, 0.5, 0.8), (8, 16, 64, "null")
+KEYS = "delay", "bandwidth", "loss"
+RADIOS = [
+    tuple(f"env.radio.{key}={value}" for key, value in zip(KEYS, values, strict=True))
+    for values in product(DELAYS, BYTES, LOSSES)
 ]
-for policy, radio in product(policies, [OFF, *radios]):
-    if (policy, json.dumps(radio)) not in found:
-        values = [float(x) for x in measured(policy, radio)]
-        found[policy, json.dumps(radio)] = values
-        with path.open("a") as file:
-            file.write(json.dumps({"policy": policy, "radio": radio, "values": values}) + "\n")
+OFF = ("env.radio.range=0",)
+FULL = "env.radio.range=.inf", "env.radio.fade=false", *RADIOS[3 * len(LOSSES)]
 
-plot = Figure(figsize=(3 * len(BYTES), 2.6 * len(policies)), layout="constrained")
-panels = plot.subplots(len(policies), len(BYTES), squeeze=False)
-for (row, policy), (column, most) in product(enumerate(policies), enumerate(BYTES)):
-    off, panel = found[policy, json.dumps(OFF)], panels[row][column]
-    at = [x for x in radios if x["env.radio.bandwidth"] == most]
-    on = [found[policy, json.dumps(radio)] for radio in at]
-    gains = [float(np.mean(values) - np.mean(off)) for values in on]
-    panel.imshow(np.reshape(gains, (len(DELAYS), -1)), cmap="PuOr", vmin=-10, vmax=10)
-    for number, values in enumerate(on):
-        low, high = bootstrap.interval(gain, off, values, paired=True) or (0, 0)
-        text = f"{gains[number]:.1f}" if low > 0 or high < 0 else f"({gains[number]:.1f})"
-        y, x = divmod(number, len(LOSSES))
-        panel.text(x, y, text, ha="center", va="center", fontsize=8)
-    panel.set_xticks(range(len(LOSSES)), LOSSES)
-    panel.set_yticks(range(len(DELAYS)), DELAYS)
-    panel.set(xlabel="loss", ylabel="delay, steps")
-    panel.set_title(f"{Path(policy).name}, {'no limit' if most is None else f'{most} bytes'}")
-plot.savefig(figure)
+
+def measured(policy: str, settings: list[str]) -> dict:
+    """Returns the world, the headline and its value on each fire."""
+    scripted = policy in SCRIPTED.known()
+    loaded = None if scripted else load_policy(read_run(policy), settings, device="cpu")
+    config = world_config(settings) if loaded is None else loaded.config
+    fires = fires_of(config.fire).fires("test", FIRES, config.env.grid, config.env.horizon)
+    if loaded is None:
+        found = play_scripted(config, policy, fires, block=FIRES)
+    else:
+        found = play_learned(config, loaded.actor, fires, block=FIRES)
+    headline = config.evaluation.headline
+    return {"world": config.world, "headline": headline, "values": list(found[headline])}
+
+
+def draw(found: dict, policies: list[str], changes: list[str], path: Path) -> None:
+    """Draws a row for each policy and a panel for each limit of bytes."""
+    first = next(iter(found.values()))
+    plot = Figure(figsize=(4 * len(BYTES), 3.4 * len(policies)), layout="constrained")
+    plot.suptitle(f"gain and value of messages in {first['headline']}, world {first['world']}")
+    panels = plot.subplots(len(policies), len(BYTES), squeeze=False)
+    for (row, policy), (column, most) in product(enumerate(policies), enumerate(BYTES)):
+        gains, panel = np.full((len(DELAYS), len(LOSSES)), np.nan), panels[row][column]
+        for y, x in np.ndindex(gains.shape):
+            radio = RADIOS[(y * len(BYTES) + column) * len(LOSSES) + x]
+            lines = [found.get((policy, *changes, *one)) for one in (OFF, radio, FULL)]
+            samples = [np.array([line["values"]]) for line in lines if line]
+            if len(samples) < len(lines):
+                continue
+            now = gain_and_value(first["headline"], samples, retrained=False)
+            gains[y, x] = now["gain"]
+            text = "{gain:.1f} [{gain_low:.1f}, {gain_high:.1f}]".format(**now)
+            if "value" in now:
+                ends = [now["value_low"], now["value_high"]]
+                shares = 100 * np.array([now["value"], *ends], float)
+                text += "\n{:.0f} % [{:.0f}, {:.0f}]".format(*shares)
+            panel.text(x, y, text, ha="center", va="center", fontsize=6.5)
+        panel.imshow(gains, cmap="PuOr", vmin=-10, vmax=10, alpha=0.7, aspect="auto")
+        panel.set_xticks(range(len(LOSSES)), LOSSES)
+        panel.set_yticks(range(len(DELAYS)), DELAYS)
+        panel.set(xlabel="loss", ylabel="delay, steps")
+        limit = "no limit" if most == "null" else f"{most} bytes a step"
+        panel.set_title(f"{policy.removeprefix('pretrained:')}, {limit}", fontsize=9)
+    plot.savefig(path)
+
+
+def main(name: str, *words: str) -> None:
+    """Plays what is missing, radio by radio, and draws the figure."""
+    torch.set_num_threads(1)
+    policies, changes = ([w for w in words if ("=" in w) == given] for given in (False, True))
+    path = Path(f"{name}.jsonl")
+    text = path.read_text().splitlines() if path.exists() else []
+    found = {tuple(line["played"]): line for line in map(json.loads, text)}
+    simple_first = sorted(RADIOS, key=lambda radio: len({*radio} - {*FULL}))
+    try:
+        for radio, policy in product([OFF, FULL, *simple_first], policies):
+            played = (policy, *changes, *radio)
+            if played not in found:
+                found[played] = {"played": played, **measured(policy, [*changes, *radio])}
+                with path.open("a") as file:
+                    file.write(json.dumps(found[played]) + "\n")
+    finally:
+        draw(found, policies or [*{played[0]: 0 for played in found}], changes, Path(f"{name}.png"))
+
+
+main(*sys.argv[1:])

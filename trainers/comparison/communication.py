@@ -48,7 +48,7 @@ def communication_values(runs: Frame) -> Frame:
     rows = [
         {"section": runs["section"].iloc[0], "fires": fires}
         | {"label": label, "measure": measure, "radios": how}
-        | _row(measure, samples, how == "retrained")
+        | gain_and_value(measure, samples, retrained=how == "retrained")
         for fires in runs["object"].iloc[0].evaluation.results
         for found in (_of_networks(groups, fires), _of_scripted(groups, fires))
         for label, measure, how, samples in found
@@ -123,7 +123,7 @@ def _world(run: Run) -> dict[str, Any]:
     return {k: v for k, v in run.now.items() if k.startswith("env.") and not k.startswith(left_out)}
 
 
-def _row(measure: str, samples: Sequence[Values], retrained: bool) -> dict[str, Any]:
+def gain_and_value(measure: str, samples: Sequence[Values], *, retrained: bool) -> dict[str, Any]:
     """Returns the numbers of samples [seeds, fires]: radio off, the world's and maybe no limits."""
     means = [sample.mean(0) for sample in samples]
 
