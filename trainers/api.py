@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from emberlink.envs.utils.atomic_io import user_path
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.comparison.comparison import Comparison, compare_runs
 from emberlink.trainers.comparison.report import free_folder, write_report
 from emberlink.trainers.config.compose import resolve
@@ -18,8 +19,8 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import GROUPS
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
 from emberlink.trainers.evaluation.evaluate_run import evaluate_run
-from emberlink.trainers.evaluation.foreign import foreign_config, new_run, open_policy
-from emberlink.trainers.evaluation.policy import TrainedPolicy, foreign_policy, load_policy
+from emberlink.trainers.evaluation.foreign import new_run
+from emberlink.trainers.evaluation.policy import TrainedPolicy, adopted, load_policy
 from emberlink.trainers.evaluation.scores import Results
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.terminal.signals import Interruption
@@ -125,13 +126,13 @@ def evaluate(
     """Evaluates a frozen policy on test fires.
 
     Args:
-        policy: a run, see `load`, of which no file is written; or with `method` a policy of your
-            own: a TensorDictModule, an `nn.Module`, a function (`foreign.ForeignPolicy`), or a text
+        policy: a run, see `load`, of which no file is written; or with `method` also a
+            TensorDictModule, an `nn.Module`, a function (`foreign.ForeignPolicy`), or a text
             `module:NAME`, `file.py:NAME` or `file.onnx`.
-        method: the method whose observations a policy of your own reads. `settings` are then those
-            of `train` (`setup`, `world`, `fire`, `seed`, ...), since there is no run.
-        name: of a policy of your own: writes a run folder in `output`, which `compare` reads and
-            calls by this name; later commands can open the policy if it was given as a text.
+        method: the method whose observations the policy reads. `settings` are then those of
+            `train` (`setup`, `world`, `fire`, `seed`, ...).
+        name: with `method`: writes a run folder in `output`, which `compare` reads and calls by
+            this name; later commands can open the policy if it was given as a text.
         checkpoint, device, settings: see `load`.
         episodes: number of episodes, each on another fire; if None, the run's
             `evaluation.episodes`.
@@ -147,18 +148,16 @@ def evaluate(
     report = progress or (lambda *_: None)
     settings |= {} if episodes is None else {"evaluation.episodes": episodes}
     settings |= {} if scripted else {"evaluation.scripted": []}
-    reference = ""
+    if method is None and (name or not isinstance(policy, str | os.PathLike)):
+        raise UserError("evaluate(policy, METHOD, ...): METHOD says which observations it reads")
     if method is None:
         played = load(policy, checkpoint=checkpoint, device=device, **settings)
     else:
-        if isinstance(policy, (str, os.PathLike)):
-            policy, reference = open_policy(os.fspath(policy))
         chosen = [f"{key}={settings.pop(key)}" for key in GROUPS if key in settings]
         settings |= {} if device is None else {"device": device}
-        config = foreign_config(policy, method, chosen, **settings)
-        played = foreign_policy(policy, name, config)
-    if method is not None and name:
-        return evaluate_run(new_run(reference, name, played.config), played, report=report)
+        played, reference = adopted(policy, method, chosen, name=name, **settings)
+        if name:
+            return evaluate_run(new_run(reference, name, played.config), played, report=report)
     fires = played.config.evaluation.episodes
     return evaluate_policy(played.config, played.actor, fires=fires, report=report)
 

@@ -18,15 +18,16 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.base import SCRIPTED, Scripted
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.evaluation.export import Decision, export
-from emberlink.trainers.evaluation.foreign import FOREIGN, OnnxPolicy, new_run, open_policy, reopen
+from emberlink.trainers.evaluation.foreign import FOREIGN, OnnxPolicy, new_run, reference_of
+from emberlink.trainers.evaluation.policy import opened
 
 WORLD = {"setup": "tuned", "horizon": 20, "num_uavs": 3, "evaluation.scripted": []}
 SOURCE = """
 import numpy as np
 
-def rise(observation):
+def rise(observation, speed=1.0):
     assert observation.shape[1:] == (3, 6)
-    return np.full((*observation.shape[:2], 3), [0.0, 0.0, 1.0])
+    return np.full((*observation.shape[:2], 3), [0.0, 0.0, speed])
 
 def turn(observation, state):
     count = 0 if state is None else state + 1
@@ -58,7 +59,52 @@ def test_a_function_a_module_and_a_tensordict_module_fly_alike(source):
     linear.bias.data = torch.tensor([0.0, 0.0, 1.0])
     module = TensorDictModule(linear, in_keys=[keys.OBSERVATION], out_keys=[keys.ACTION])
     assert score(linear) == score(module) == by_function
+    network = torch.nn.Sequential(linear, torch.nn.Dropout(0.9))
+    assert score(network) == by_function
+    assert network[1].training
     assert score("mine.py:rise", horizon=10) != by_function
+
+
+BESIDE = """
+from __future__ import annotations
+from dataclasses import dataclass
+import numpy as np
+from {}up import UP
+
+@dataclass
+class Rise:
+    speed: float
+
+    def __call__(self, observation):
+        return np.full((*observation.shape[:2], 3), UP) * self.speed
+
+act = Rise(1.0)
+"""
+
+
+def test_a_file_imports_what_is_beside_it(source):
+    for folder, dots in (("plain", ""), ("package", ".")):
+        Path(folder).mkdir()
+        Path(folder, "up.py").write_text("UP = [0.0, 0.0, 1.0]")
+        Path(folder, "net.py").write_text(BESIDE.format(dots))
+    Path("package/__init__.py").touch()
+    for name in ("plain/net.py:act", "package/net.py:act", "package.net:act"):
+        assert score(name) == score("mine.py:rise")
+
+
+def test_a_run_flies_under_another_name(tmp_path):
+    run, short = "pretrained:strong/independent", {"episodes": 1, "horizon": 40, "scripted": False}
+    expected = trainers.evaluate(run, **short)
+    settings = {**short, "name": "again", "seed": 3, "output": str(tmp_path)}
+    assert trainers.evaluate(run, "independent", **settings) == expected
+    assert trainers.evaluate(trainers.load(run), "independent", **short) == expected
+    (folder,) = tmp_path.iterdir()
+    assert trainers.evaluate(folder, **short) == expected
+    row = trainers.compare(folder).table.iloc[0]
+    assert (row["label"], row["seed"]) == ("again", 3)
+    with pytest.raises(UserError):
+        export(folder, tmp_path / "again.onnx")
+    assert not list(tmp_path.glob("again.*"))
 
 
 def test_state_begins_with_none_and_is_handed_on(source):
@@ -161,13 +207,13 @@ def test_a_folder_that_names_code_inside_it_is_refused(tmp_path):
         reference = place.format(run=run.path)
         (run.path / FOREIGN).write_text(json.dumps({"name": "evil", "policy": reference}))
         with pytest.raises(UserError, match="names no policy outside of its folder"):
-            reopen(run)
+            reference_of(run)
 
 
 def exported(run, tmp_path):
     """Exports a run, and returns its policy and the ONNX file's."""
     export(str(run), tmp_path / "policy.onnx")
-    return trainers.load(run), open_policy(str(tmp_path / "policy.onnx"))[0]
+    return trainers.load(run), opened(str(tmp_path / "policy.onnx"))[0]
 
 
 def check_same_actions(policy, onnx: OnnxPolicy, steps: int, num_envs: int = 2, **changes):

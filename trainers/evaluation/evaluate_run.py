@@ -5,7 +5,6 @@ import hashlib
 import re
 from collections.abc import Callable
 from dataclasses import asdict
-from pathlib import Path
 
 from rich.console import Console
 
@@ -15,15 +14,8 @@ from emberlink.envs.utils.errors import UserError, naming
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate, figures
 from emberlink.trainers.evaluation.episodes import recorder_of, title_of
-from emberlink.trainers.evaluation.foreign import (
-    FOREIGN,
-    foreign_config,
-    foreign_name,
-    is_reference,
-    new_run,
-    open_policy,
-)
-from emberlink.trainers.evaluation.policy import TrainedPolicy, load_policy
+from emberlink.trainers.evaluation.foreign import FOREIGN, foreign_name, is_reference, new_run
+from emberlink.trainers.evaluation.policy import TrainedPolicy, adopted, load_policy
 from emberlink.trainers.evaluation.scores import LEARNED, Results, print_results, reporter
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.recording import Episode
@@ -39,10 +31,12 @@ _MAX_LABEL = 150
 def run_command(options: argparse.Namespace, console: Console) -> int:
     """Runs `emberlink eval`: evaluates a run, prints the table and returns 0."""
     changes, file = options.overrides, options.checkpoint
-    if is_reference(options.folder):
-        options.folder, changes = str(_foreign_run(options)), []
-    policy = load_policy(read_run(options.folder), changes, checkpoint=file, device=options.device)
-    run = open_run(options.folder)  # copies a trained policy of the package once all is checked
+    if is_reference(options.folder) or options.name:
+        (policy, run), changes = _new_run(options), []
+    else:
+        folder, device = read_run(options.folder), options.device
+        policy = load_policy(folder, changes, checkpoint=file, device=device)
+        run = open_run(options.folder)  # copies a trained policy of the package once all is checked
     about = [file.stem] if file else []
     parts = [*about, *(re.sub(r"[^\w.=+-]", "-", text) for text in changes)]
     label = "".join(f"_{part}" for part in parts)
@@ -55,8 +49,8 @@ def run_command(options: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def _foreign_run(options: argparse.Namespace) -> Path:
-    """Creates the run folder of a policy that emberlink has not trained."""
+def _new_run(options: argparse.Namespace) -> tuple[TrainedPolicy, RunFolder]:
+    """Returns a policy that is evaluated with a method and a name, and its new run folder."""
     method, *settings = options.overrides or [""]
     if not method or "=" in method or not options.name or options.checkpoint:
         raise UserError(
@@ -64,8 +58,8 @@ def _foreign_run(options: argparse.Namespace) -> Path:
             "--name NAME; METHOD says which observations it reads"
         )
     settings += [f"device={options.device}"] if options.device else []
-    policy, reference = open_policy(options.folder)
-    return new_run(reference, options.name, foreign_config(policy, method, settings)).path
+    policy, reference = adopted(options.folder, method, settings, name=options.name)
+    return policy, new_run(reference, options.name, policy.config)
 
 
 def evaluate_run(

@@ -13,14 +13,13 @@ from torch import Tensor, nn
 from torch.export import Dim
 
 from emberlink.envs.utils.atomic_io import created, new_file
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, require
 from emberlink.envs.utils.validation import shown
-from emberlink.policies.hold import Held
 from emberlink.trainers.build import make_env
-from emberlink.trainers.config.compose import differences, resolve, to_values
+from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import flat
-from emberlink.trainers.evaluation.foreign import METADATA
+from emberlink.trainers.evaluation.foreign import METADATA, foreign_name
 from emberlink.trainers.evaluation.policy import TrainedPolicy, load_policy
 from emberlink.trainers.evaluation.scores import LEARNED, means
 from emberlink.trainers.runs.checkpoint import read_header, versions
@@ -45,7 +44,7 @@ class Decision(nn.Module):
 
     def __init__(self, policy: TrainedPolicy):
         super().__init__()
-        self.policy: Any = policy.actor.policy if isinstance(policy.actor, Held) else policy.actor
+        self.policy: Any = policy.decision
         self.reads, self.writes = list(self.policy.in_keys), list(self.policy.out_keys)
         self.inputs = [key if isinstance(key, str) else key[-1] for key in self.reads]
         self.outputs = ["next_" * (key[0] == "next") + key[-1] for key in self.writes]
@@ -66,13 +65,11 @@ def export(run: str | PathLike[str], file: str | Path) -> tuple[Path, Path]:
     """
     path = new_file(Path(file), (".onnx",))
     card_path = new_file(path.with_suffix(".json"), (".json",))
-    try:
-        import onnxruntime  # noqa: F401
-        import onnxscript  # noqa: F401  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        needed = "pip install 'emberlink[export]'"
-        raise UserError(f"export needs {error.name}: {needed}") from None
-    policy = load_policy(read_run(fspath(run)), device="cpu")
+    require("onnxscript", "export", "export")
+    folder = read_run(fspath(run))
+    if foreign_name(folder):
+        raise UserError(f"{folder.path}: has no networks of emberlink to export")
+    policy = load_policy(folder, device="cpu")
     decision = Decision(policy)
     fire = torch.full(policy.config.env.grid, torch.inf)
     start = make_env(policy.config, num_envs=3, fire=fire, seed=0).reset()
@@ -114,15 +111,12 @@ def card_of(
 ) -> dict[str, Any]:
     """Returns facts for the user of an exported policy, as plain values."""
     config, values = policy.config, flat(to_values(policy.config))
-    names = [f"{key}={values[key]}" for key in ("setup", "world")]
-    changed = differences(config, resolve(config.method, names))
-    own = [key for key in changed if key.startswith(("env.", "comm.", "policy."))]
     file = policy.checkpoint.with_name("eval.json")
     results = json.loads(read_text(file, MAX_JSON))["results"] if file.exists() else {}
     shapes = zip(decision.inputs, example, strict=True)
     return {
         "method": config.method,
-        "settings": [*names, *(f"{key}={shown(values[key])}" for key in own)],
+        "settings": policy.settings,
         "decides_every": config.policy.hold,
         "inputs": {
             name: {

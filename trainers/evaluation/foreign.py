@@ -8,7 +8,7 @@ import re
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,8 +21,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.utils import get_primers_from_module
 
 from emberlink.envs import keys
-from emberlink.envs.utils.errors import UserError, naming
-from emberlink.trainers.config.compose import resolve
+from emberlink.envs.utils.errors import UserError, naming, require
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.pretrained import is_name
 from emberlink.trainers.runs.run_folder import MAX_YAML, RunFolder, read_text
@@ -61,6 +60,8 @@ class ForeignPolicy(TensorDictModuleBase):
             self._stateful = takes_state(policy)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        in_training = [layer for layer in self.modules() if layer.training]
+        self.eval()  # dropout, batch norm
         try:
             with set_exploration_type(ExplorationType.DETERMINISTIC):
                 action = self._act(tensordict)
@@ -72,6 +73,9 @@ class ForeignPolicy(TensorDictModuleBase):
             raise UserError(
                 f"{self.name}: {type(error).__name__}: {told} ({last.filename}:{last.lineno})"
             ) from error
+        finally:
+            for layer in in_training:
+                layer.training = True
         expected = (*tensordict.get(keys.POSITION).shape[:-1], 3)
         if tuple(action.shape) != expected:
             raise UserError(
@@ -116,10 +120,9 @@ class OnnxPolicy:
     """
 
     def __init__(self, file: Path):
-        try:
-            import onnxruntime
-        except ImportError:
-            raise UserError(f"{file}: needs onnxruntime: pip install 'emberlink[export]'") from None
+        require("onnxruntime", "export", str(file))
+        import onnxruntime
+
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         try:
@@ -131,7 +134,7 @@ class OnnxPolicy:
         if "action" not in self.outputs:
             raise UserError(f"{file}: has no output 'action'; outputs: {', '.join(self.outputs)}")
         text = self.session.get_modelmeta().custom_metadata_map.get(METADATA, "{}")
-        self.card: dict[str, Any] = json.loads(text)
+        self.settings: list[str] = json.loads(text).get("settings", [])
 
     def __call__(self, tensordict: TensorDictBase, state: Any) -> tuple[Tensor, Any]:
         place, given = tensordict.get(keys.POSITION), {}
@@ -150,17 +153,6 @@ class OnnxPolicy:
         return torch.as_tensor(out["action"]).to(place), after
 
 
-def foreign_config(
-    policy: Any, method: str, overrides: Sequence[str] = (), **settings: Any
-) -> RunConfig:
-    """Returns the configuration of the environment that a policy flies in, see `resolve`.
-
-    An ONNX file of `emberlink export` chooses setup, world and hold, unless they are given.
-    """
-    card = policy.card if isinstance(policy, OnnxPolicy) else {}
-    return resolve(method, [*card.get("settings", ()), *overrides], **settings)
-
-
 def new_run(reference: str, name: str, config: RunConfig) -> RunFolder:
     """Creates a run folder for a policy that emberlink has not trained.
 
@@ -176,31 +168,27 @@ def new_run(reference: str, name: str, config: RunConfig) -> RunFolder:
 
 def foreign_name(run: RunFolder) -> str:
     """Returns the name of a run's policy if emberlink has not trained it, else an empty text."""
-    return _read(run)["name"] if (run.path / FOREIGN).exists() else ""
+    return _read(run, "name") if (run.path / FOREIGN).exists() else ""
 
 
-def reopen(run: RunFolder) -> Any:
-    """Returns the policy of a run that `new_run` has made.
+def reference_of(run: RunFolder) -> str:
+    """Returns by which text the policy of a run that `new_run` has made is opened.
 
-    A folder from somebody else must not name code that came with it, so only whole paths outside of
-    it are opened.
+    A folder from somebody else must not name code that came with it, so it is a whole path outside
+    of the folder.
     """
-    text = _read(run)["policy"]
-    file = Path(text if text.endswith(".onnx") else text.rpartition(":")[0])
-    if not file.is_absolute() or run.path.resolve() in file.resolve().parents:
+    text = _read(run, "policy")
+    file = Path(_split(text)[0] or text)
+    inside = run.path.resolve() in (file.resolve(), *file.resolve().parents)
+    if inside or not file.is_absolute():
         raise UserError(f"{run.path / FOREIGN}: names no policy outside of its folder: {text!r}")
-    return open_policy(text)[0]
+    return text
 
 
-def _read(run: RunFolder) -> dict[str, str]:
+def _read(run: RunFolder, key: str) -> str:
     file = run.path / FOREIGN
-    with naming(file):
-        values = json.loads(read_text(file, MAX_YAML))
-        if not isinstance(values, dict) or not all(
-            isinstance(values.get(key), str) for key in ("name", "policy")
-        ):
-            raise UserError("expected the texts `name` and `policy`")
-    return values
+    with naming(file, KeyError, TypeError):
+        return str(json.loads(read_text(file, MAX_YAML))[key])
 
 
 def is_reference(text: str) -> bool:
@@ -209,7 +197,7 @@ def is_reference(text: str) -> bool:
 
 
 def open_policy(text: str) -> tuple[Any, str]:
-    """Returns the policy of `module:name`, `file.py:name` or `file.onnx`.
+    """Returns the policy of `module:name`, `file.py:name` or `file.onnx`; see `policy.opened`.
 
     The second result is FILE:NAME or FILE.onnx with the whole path, by which it is opened again.
 
@@ -239,24 +227,35 @@ def _split(text: str) -> tuple[str, str]:
 
 
 def _module(place: str) -> Any:
-    if not place.endswith(".py"):
-        sys.path.insert(0, "")  # modules of the working folder, as with python -m
-        try:
-            return importlib.import_module(place)
-        finally:
-            sys.path.remove("")
-    spec: Any = importlib.util.spec_from_file_location(Path(place).stem, place)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    """Imports a module of the working folder, or a file, which may import what is beside it."""
+    name, folders = place, [""]  # as with python -m
+    if is_file := place.endswith(".py"):
+        folder = Path(place).absolute().parent
+        name, folders = Path(place).stem, [str(folder)]  # as with python FILE
+        while (folder / "__init__.py").exists():
+            name, folder = f"{folder.name}.{name}", folder.parent
+        folders.append(str(folder))
+    sys.path[:0] = folders
+    try:
+        if not is_file or folders[0] != folders[1]:
+            return importlib.import_module(name)
+        spec: Any = importlib.util.spec_from_file_location(place, place)
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[place] = module  # where dataclasses look for it
+        spec.loader.exec_module(module)
+        return module
+    finally:
+        for path in folders:
+            sys.path.remove(path)
 
 
 def takes_state(policy: Callable[..., Any]) -> bool:
-    """Returns whether a function, or the `forward` of a module, has a second argument."""
+    """Returns whether a function, or a module's `forward`, has a second argument, None at first."""
     call = policy.forward if isinstance(policy, nn.Module) else policy
     try:
         parameters = inspect.signature(call).parameters.values()
     except ValueError:  # of a function that is not written in Python
         return False
     by_place = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return sum(one.kind in by_place for one in parameters) > 1
+    placed = [one for one in parameters if one.kind in by_place]
+    return len(placed) > 1 and (placed[1].default is None or placed[1].default is placed[1].empty)

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
+from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +13,26 @@ from emberlink.comm.base import MODULES
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
-from emberlink.policies.hold import held
+from emberlink.policies.hold import Held, held
 from emberlink.policies.state import primer_of
 from emberlink.trainers.build import build_actor, empty_env
-from emberlink.trainers.config.compose import differences, evaluated_with
+from emberlink.trainers.config.compose import differences, evaluated_with, resolve, to_values
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.config.values import parse
+from emberlink.trainers.config.values import flat, parse
 from emberlink.trainers.evaluation.episodes import Panel, play_side_by_side, scripted, title_of
-from emberlink.trainers.evaluation.foreign import FOREIGN, ForeignPolicy, foreign_name, reopen
+from emberlink.trainers.evaluation.foreign import (
+    FOREIGN,
+    ForeignPolicy,
+    OnnxPolicy,
+    foreign_name,
+    is_reference,
+    open_policy,
+    reference_of,
+)
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.runs.checkpoint import load_weights, read_header
+from emberlink.trainers.runs.pretrained import read_run
 from emberlink.trainers.runs.run_folder import RunFolder
 
 _CHANGEABLE = ("world", "edition", "fire", "env", "comm", "evaluation")
@@ -61,6 +71,20 @@ class TrainedPolicy(TensorDictSequential):
     def actor(self) -> Any:
         """The networks, with held actions."""
         return self.module[0]
+
+    @property
+    def decision(self) -> Any:
+        """The networks, which decide each time they are called."""
+        return self.actor.policy if isinstance(self.actor, Held) else self.actor
+
+    @property
+    def settings(self) -> list[str]:
+        """Settings of its environment and of how it decides, as texts `key=value`."""
+        values = flat(to_values(self.config))
+        names = [f"{key}={values[key]}" for key in ("setup", "world")]
+        changed = differences(self.config, resolve(self.config.method, names))
+        own = [key for key in changed if key.startswith(("env.", "comm.", "policy."))]
+        return [*names, *(f"{key}={shown(values[key])}" for key in own)]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Returns a transform that adds the policy's state to an environment; `make_env` does."""
@@ -124,14 +148,42 @@ def load_policy(
         )
     changes = [*overrides, *(f"{key}={shown(value)}" for key, value in (settings or {}).items())]
     if file is None:
-        return foreign_policy(reopen(run), name, config, changes)
+        return foreign_policy(opened(reference_of(run))[0], name, config, changes)
     return TrainedPolicy(load_actor(config, file), config, file, changes)
+
+
+def opened(text: str) -> tuple[Any, str]:
+    """Returns a policy given as text, a run's too, and by which text it is opened again."""
+    if is_reference(text):
+        return open_policy(text)
+    run = read_run(text)
+    return load_policy(run), str(run.path.absolute())
+
+
+def adopted(
+    policy: Any, method: str, overrides: Sequence[str] = (), *, name: str = "", **settings: Any
+) -> tuple[TrainedPolicy, str]:
+    """Returns a policy for the environment of a method, and by which text it is opened again.
+
+    A run, or an ONNX file of `emberlink export`, chooses setup, world and hold unless `overrides`
+    or `settings` do, see `resolve`.
+
+    Args:
+        policy: see `foreign.ForeignPolicy`; or a text, or a run's folder, see `opened`.
+    """
+    reference = ""
+    if isinstance(policy, str | PathLike):
+        policy, reference = opened(fspath(policy))
+    usual = policy.settings if isinstance(policy, TrainedPolicy | OnnxPolicy) else ()
+    config = resolve(method, [*usual, *overrides], **settings)
+    return foreign_policy(policy, name, config), reference
 
 
 def foreign_policy(
     policy: Any, name: str, config: RunConfig, changes: Sequence[str] = ()
 ) -> TrainedPolicy:
-    """Returns a policy that emberlink has not trained, deciding as often as `policy.hold` says."""
+    """Returns a policy of any kind, which decides as often as `policy.hold` says."""
+    policy = policy.decision if isinstance(policy, TrainedPolicy) else policy
     observed = keys.observation_keys(empty_env(config).observation_spec)
     actor: Any = ForeignPolicy(policy, name or "policy", observed)
     actor = held(actor, config.policy.hold, config.env.num_uavs)
