@@ -1,7 +1,7 @@
 """Defines communication modules and the transform that adds one to an environment."""
 
-from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Iterator
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -16,17 +16,6 @@ from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.world import radio
-
-
-class Heard(NamedTuple):
-    """What communication makes of successive time steps."""
-
-    last: TensorDictBase
-    """the last one, rewritten"""
-    bonus: Tensor | None
-    """float32 [steps, num_envs, n]: terms to add to the rewards"""
-    sent: Tensor | None
-    """int64 [steps, num_envs, n]: bytes that each UAV sends"""
 
 
 class CommModule(TensorDictModuleBase):
@@ -126,17 +115,27 @@ class CommModule(TensorDictModuleBase):
         """
         return None
 
-    def take_part(self, steps: Sequence[TensorDictBase]) -> Heard:
+    def take_part(
+        self, steps: TensorDictBase, last: TensorDictBase
+    ) -> tuple[TensorDictBase, Tensor | None, Tensor | None]:
         """Takes part in successive time steps, one after another, and rewrites the last one.
 
         A module may compute them together, with the same result.
+
+        Args:
+            steps: batch size [steps, num_envs].
+            last: the last one of them, batch size [num_envs].
+
+        Returns:
+            The rewritten step; terms to add to the rewards, float32 [steps, num_envs, n], or None;
+            and the bytes that each UAV sends, int64 [steps, num_envs, n], or None.
         """
-        bonus, sent, last = [], [], steps[-1]
-        for step in steps:
+        bonus, sent = [], []
+        for step in successive(steps, last):
             bonus.append(self.shaping(step))
             last = self.rewrite(step)
             sent.append(self.bytes_sent(last) if self.counts else None)
-        return Heard(self.show(last), _stacked(bonus), _stacked(sent))
+        return self.show(last), _stacked(bonus), _stacked(sent)
 
     def rewrite(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Enters what the UAVs see into their maps, if they have any, and calls `forward`."""
@@ -169,9 +168,11 @@ class CommModule(TensorDictModuleBase):
         return self.world.measures == "all" and self.world.radio.range > 0
 
 
-def of_steps(steps: Sequence[TensorDictBase], key: Any) -> Tensor:
-    """Returns an entry of successive time steps, [steps, num_envs, ...]."""
-    return torch.stack([step.get(key) for step in steps])
+def successive(steps: TensorDictBase, last: TensorDictBase) -> Iterator[TensorDictBase]:
+    """Yields the time steps of `CommModule.take_part`, one after another."""
+    for number in range(len(steps) - 1):
+        yield steps[number]  # pyright: ignore[reportReturnType]
+    yield last
 
 
 def _stacked(parts: list[Tensor | None]) -> Tensor | None:
@@ -242,71 +243,77 @@ class Communication(Transform):
         return tensordict if self._joined else self._steered(tensordict)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict if self._joined else self._stepped([next_tensordict])[0]
+        if self._joined:
+            return next_tensordict
+        if not self.module.every_step:  # nothing but the observation changes
+            return self._heard(next_tensordict)
+        return self._stepped(next_tensordict.unsqueeze(0), next_tensordict)[0]
 
     def _steered(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the action to perform at a step."""
         action = self.module.steer(tensordict)
         return tensordict if action is None else tensordict.set(keys.ACTION, action)
 
-    def _stepped(self, steps: Sequence[TensorDictBase]) -> tuple[TensorDictBase, dict[Any, Tensor]]:
-        """Communicates after successive steps of the environment.
+    def _stepped(
+        self, steps: TensorDictBase, last: TensorDictBase
+    ) -> tuple[TensorDictBase, dict[Any, Tensor]]:
+        """Communicates after successive steps of the environment, see `CommModule.take_part`.
 
         Returns:
             The last time step, and the entries of all steps that communication has changed,
             [steps, num_envs, ...].
         """
         self._listen(steps)
-        last, bonus, sent = self.module.take_part(steps)
-        changed: dict[Any, Tensor] = {keys.REWARD: of_steps(steps, keys.REWARD)}
+        if self.listens:
+            last.set(keys.HEARS, steps.get(keys.HEARS)[-1])
+        last, bonus, sent = self.module.take_part(steps, last)
+        changed = self._bytes(steps, sent)
         if bonus is not None:
             if self.module.world.failures:
-                bonus = bonus.masked_fill(~of_steps(steps, keys.ALIVE), 0.0)
-            changed[keys.REWARD] = changed[keys.REWARD] + bonus.unsqueeze(-1)
-        changed |= self._bytes(steps, sent)
+                bonus = bonus.masked_fill(~steps.get(keys.ALIVE), 0.0)
+            changed[keys.REWARD] = steps.get(keys.REWARD) + bonus.unsqueeze(-1)
         for key, value in changed.items():
             last.set(key, value[-1])
         return last, changed
 
     def _begin(self, tensordict: TensorDictBase, mask: Tensor) -> TensorDictBase:
         """Starts the episodes of the environments of a mask, bool [num_envs]."""
+        self.module.reset(tensordict, mask)
+        if self.module.maps is not None:
+            self.module.maps.start_episodes(mask)
+        return self._heard(tensordict)
+
+    def _heard(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Communicates at a time step that no reward leads to, or at which none changes."""
         module = self.module
-        module.reset(tensordict, mask)
-        if module.maps is not None:
-            module.maps.start_episodes(mask)
-        self._listen([tensordict])
+        self._listen(tensordict)
         heard = module.show(module.rewrite(tensordict))
         sent = module.bytes_sent(heard) if module.counts else None
-        sent = None if sent is None else sent.unsqueeze(0)
-        for key, value in self._bytes([heard], sent).items():
-            heard.set(key, value[0])
-        return heard
+        return heard.update(self._bytes(heard, sent))
 
-    def _listen(self, steps: Sequence[TensorDictBase]) -> None:
+    def _listen(self, steps: TensorDictBase) -> None:
         """Writes the links of time steps, if the module or the policy reads them."""
-        world = self.module.world
         if self.listens:
-            at = (of_steps(steps, key) for key in (keys.POSITION, keys.RNG_KEY, keys.STEP))
-            alive = of_steps(steps, keys.ALIVE) if world.failures else None
-            _, hears = self.channel(*at, alive)
-            for step, links in zip(steps, hears, strict=True):
-                left = self.module.budget(step) if self.message_bytes else None
-                step.set(keys.HEARS, links if left is None else links & (left >= 0).unsqueeze(-2))
+            at = (steps.get(key) for key in (keys.POSITION, keys.RNG_KEY, keys.STEP))
+            _, hears = self.channel(
+                *at, steps.get(keys.ALIVE) if self.module.world.failures else None
+            )
+            left = self.module.budget(steps) if self.message_bytes else None
+            steps.set(keys.HEARS, hears if left is None else hears & (left >= 0).unsqueeze(-2))
 
-    def _bytes(self, steps: Sequence[TensorDictBase], sent: Tensor | None) -> dict[Any, Tensor]:
+    def _bytes(self, steps: TensorDictBase, sent: Tensor | None) -> dict[Any, Tensor]:
         """Returns the bytes that the UAVs send, in a world in which they are measured."""
         world = self.module.world
         if world.measures != "all":
             return {}
-        alive = of_steps(steps, keys.ALIVE)
+        alive = steps.get(keys.ALIVE)
         total = torch.zeros_like(alive, dtype=torch.int64) if sent is None else sent * alive
         if world.reports:
-            total = total + of_steps(steps, keys.REPORT_BYTES)
+            total = total + steps.get(keys.REPORT_BYTES)
         if self.message_bytes and world.radio.range:
-            says = alive & (of_steps(steps, keys.STEP) % self.module.hold == 0).unsqueeze(-1)
-            left = [self.module.budget(step) for step in steps]
-            says &= torch.stack([says[0] | True if x is None else x >= 0 for x in left])
-            total = total + self.message_bytes * says
+            says = alive & (steps.get(keys.STEP) % self.module.hold == 0).unsqueeze(-1)
+            left = self.module.budget(steps)
+            total = total + self.message_bytes * (says if left is None else says & (left >= 0))
         return {keys.BYTES_SENT: total}
 
     def _check_keys(self, tensordict: TensorDictBase) -> None:

@@ -1,7 +1,6 @@
 """Consensus communication: method 4 of the paper (section IV.F, algorithm 3)."""
 
-from collections.abc import Sequence
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import Field
@@ -10,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 
-from emberlink.comm.base import CommModule, Heard, of_steps
+from emberlink.comm.base import CommModule, successive
 from emberlink.envs import keys
 from emberlink.envs.config import Number, WildfireConfig
 from emberlink.envs.utils import counter_rng
@@ -58,27 +57,6 @@ class ConsensusConfig:
     """steps after which random targets are drawn again, even if not reached; None for never"""
     heading: HeadingConfig = HeadingConfig()
     """the bonus for flying towards the target"""
-
-
-class TimeSteps(NamedTuple):
-    """The read entries of successive time steps, [steps, num_envs, ...]; see `keys`."""
-
-    position: Tensor
-    hears: Tensor
-    rng_key: Tensor
-    step: Tensor
-    new_fire: Tensor
-    old_fire: Tensor
-    new_centre: Tensor
-    old_centre: Tensor
-    hit_boundary: Tensor
-
-    @classmethod
-    def of(cls, steps: Sequence[TensorDictBase]) -> "TimeSteps":
-        """Stacks the entries of time steps."""
-        fire = keys.NEW_FIRE, keys.OLD_FIRE, keys.NEW_CENTRE, keys.OLD_CENTRE
-        read = keys.POSITION, keys.HEARS, keys.RNG_KEY, keys.STEP, *fire, keys.HIT_BOUNDARY
-        return cls(*(of_steps(steps, key) for key in read))
 
 
 class Consensus(CommModule):
@@ -167,48 +145,48 @@ class Consensus(CommModule):
             self.received[mask] = -1.0
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self._rewrite([tensordict]).last
+        self._rewrite(tensordict.unsqueeze(0), tensordict)
+        return tensordict
 
-    def take_part(self, steps: Sequence[TensorDictBase]) -> Heard:
+    def take_part(
+        self, steps: TensorDictBase, last: TensorDictBase
+    ) -> tuple[TensorDictBase, Tensor | None, Tensor | None]:
         if self.maps is not None:
-            for step in steps:
+            for step in successive(steps, last):
                 self.maps.look(step)
-        heard = self._rewrite(steps)
-        self.show(heard.last)
-        return heard
+        bonus, sent = self._rewrite(steps, last)
+        return self.show(last), bonus, sent
 
-    def _rewrite(self, steps: Sequence[TensorDictBase]) -> Heard:
+    def _rewrite(
+        self, steps: TensorDictBase, last: TensorDictBase
+    ) -> tuple[Tensor | None, Tensor | None]:
         """Rewrites the last time step; what depends on the step before is computed in turn."""
-        read, last = TimeSteps.of(steps), steps[-1]
-        discovers = self._discovers(read.new_fire, read.old_fire)
-        rank = self._update_track_record(read, discovers)
+        position = steps.get(keys.POSITION)
+        discovers = self._discovers(steps)
+        rank = self._update_track_record(steps, discovers)
         best = self.config.follow == "best"
         if self.world.radio.packets:
-            budgets = [self.budget(step) for step in steps]
-            known, records, sent = self._converse(read, discovers, rank, budgets)
+            known, records, sent = self._converse(steps, discovers, rank)
             places = records[..., 1:4].float()
-            cost = (
-                -records[..., 4] if best else motion.distance(read.position.unsqueeze(-2), places)
-            )
+            cost = -records[..., 4] if best else motion.distance(position.unsqueeze(-2), places)
         else:
-            known = known_discoverers(read.hears, discovers, agree=self.config.agree)
-            places = read.position.unsqueeze(-3).expand(*known.shape, 3)
-            cost = -rank.unsqueeze(-2) if best else pairwise_distance(read.position)
+            known = known_discoverers(steps.get(keys.HEARS), discovers, agree=self.config.agree)
+            places = position.unsqueeze(-3).expand(*known.shape, 3)
+            cost = -rank.unsqueeze(-2) if best else pairwise_distance(position)
             sent = self._bytes(discovers, known)
         follows = choose_leader(known, cost, discovers)
-        target = self._targets(read, discovers, follows, places)
-        bonus = self._bonus(read, discovers, follows, target)
+        target = self._targets(steps, discovers, follows, places)
+        bonus = self._bonus(steps, discovers, follows, target)
         relative = self.config.target == "relative"
-        shown = self._scaled(target[-1] - read.position[-1] if relative else target[-1])
+        shown = self._scaled(target[-1] - position[-1] if relative else target[-1])
         last.set(keys.OBSERVATION, torch.cat((last.get(keys.OBSERVATION), shown), -1))
         last.set(keys.FOLLOWS, follows[-1]).set(keys.TARGET, target[-1])
-        return Heard(last, bonus, sent if self.counts else None)
+        return bonus, sent if self.counts else None
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
         if self.world.radio.packets:
             return self.said.clone()
-        fire = (tensordict.get(key) for key in (keys.NEW_FIRE, keys.OLD_FIRE))
-        discovers = self._discovers(*fire)
+        discovers = self._discovers(tensordict)
         known = known_discoverers(tensordict.get(keys.HEARS), discovers, agree=self.config.agree)
         return self._bytes(discovers, known)
 
@@ -221,7 +199,7 @@ class Consensus(CommModule):
         return RECORD_BYTES * torch.where(discovers, 1, passed_on)
 
     def _converse(
-        self, steps: TimeSteps, discovers: Tensor, rank: Tensor, budgets: Sequence[Tensor | None]
+        self, steps: TensorDictBase, discovers: Tensor, rank: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Passes on records of discoverers, one link a step.
 
@@ -234,20 +212,20 @@ class Consensus(CommModule):
         """
         uavs, size = discovers.shape[-1], RECORD_BYTES + LATE_BYTES
         own = torch.eye(uavs, dtype=torch.bool, device=discovers.device)
-        known, records, sent = [], [], []
-        for number, (finds, now) in enumerate(zip(discovers, steps.step, strict=True)):
+        step, position, hears = (steps.get(k) for k in (keys.STEP, keys.POSITION, keys.HEARS))
+        budget, known, records, sent = self.budget(steps), [], [], []
+        for number, (finds, now) in enumerate(zip(discovers, step, strict=True)):
             stamp = now.view(-1, 1, 1).expand(-1, uavs, 1).double()
-            mine = torch.cat((stamp, steps.position[number], rank[number].unsqueeze(-1)), -1)
+            mine = torch.cat((stamp, position[number], rank[number].unsqueeze(-1)), -1)
             says = torch.where(finds.unsqueeze(-1), own, self.received[..., 0] >= 0)
             says &= finds.unsqueeze(-1) | self.config.agree
             record = torch.where(own.unsqueeze(-1), mine.unsqueeze(1), self.received)
-            left = budgets[number]
-            if left is not None:
+            if budget is not None:
                 order = record[..., 4].masked_fill(~says, -torch.inf).argsort(-1, descending=True)
-                says &= order.argsort(-1) < (left // size).unsqueeze(-1)
+                says &= order.argsort(-1) < (budget[number] // size).unsqueeze(-1)
             self.said.copy_(size * says.sum(-1))
             heard = self.records(now, torch.where(says.unsqueeze(-1), record, -1.0))
-            links = self.links(now, steps.hears[number])
+            links = self.links(now, hears[number])
             # [num_envs, hearers, speakers, discoverers]
             told = torch.where(links.unsqueeze(-1), heard[..., 0].unsqueeze(1), -1.0)
             told, speaker = told.masked_fill(own.unsqueeze(-2), -1.0).max(2)
@@ -261,13 +239,14 @@ class Consensus(CommModule):
             sent.append(self.said.clone())
         return torch.stack(known), torch.stack(records), torch.stack(sent)
 
-    def _discovers(self, new_fire: Tensor, old_fire: Tensor) -> Tensor:
+    def _discovers(self, steps: TensorDictBase) -> Tensor:
         """Returns whether each UAV is a discoverer, bool [..., n]."""
-        return (new_fire + old_fire if self.config.discoverer == "any_fire" else new_fire) > 0
+        new, old = steps.get(keys.NEW_FIRE), steps.get(keys.OLD_FIRE)
+        return (new + old if self.config.discoverer == "any_fire" else new) > 0
 
-    def _update_track_record(self, steps: TimeSteps, discovers: Tensor) -> Tensor:
+    def _update_track_record(self, steps: TensorDictBase, discovers: Tensor) -> Tensor:
         """Adds the steps to the track records; returns ranks, float64 [steps, num_envs, n]."""
-        discovered, altitude = steps.new_fire, steps.position[..., 2].double()
+        discovered, altitude = steps.get(keys.NEW_FIRE), steps.get(keys.POSITION)[..., 2].double()
         records = []
         for new, height, counts in zip(discovered, altitude, discovers, strict=True):
             self.fire_score.add_(new).mul_(counts)
@@ -276,30 +255,30 @@ class Consensus(CommModule):
         return torch.stack(records) * (discovered / altitude)
 
     def _targets(
-        self, steps: TimeSteps, discovers: Tensor, follows: Tensor, places: Tensor
+        self, steps: TensorDictBase, discovers: Tensor, follows: Tensor, places: Tensor
     ) -> Tensor:
         """Returns the targets, float32 [steps, num_envs, n, 3].
 
         Args:
             places: float32 [steps, num_envs, n, n, 3], of UAVs as each UAV (row) has heard of them.
         """
-        position = steps.position
+        position = steps.get(keys.POSITION)
         wanders = (follows < 0).unsqueeze(-1)
         alone = self._wander(steps, wanders) if self.config.wander else position
-        new = (steps.new_fire > 0).unsqueeze(-1)
-        centre = torch.where(new, steps.new_centre, steps.old_centre)
+        new = (steps.get(keys.NEW_FIRE) > 0).unsqueeze(-1)
+        centre = torch.where(new, steps.get(keys.NEW_CENTRE), steps.get(keys.OLD_CENTRE))
         leader = follows.clamp(min=0)[..., None, None].expand(*follows.shape, 1, 3)
         target = torch.where(wanders, alone, places.gather(-2, leader).squeeze(-2))
         over_fire = torch.cat((centre, position[..., 2:]), -1)
         target = torch.where(discovers.unsqueeze(-1), over_fire, target)
         return self._jittered(steps, target) if self.config.jitter else target
 
-    def _wander(self, steps: TimeSteps, wanders: Tensor) -> Tensor:
+    def _wander(self, steps: TensorDictBase, wanders: Tensor) -> Tensor:
         """Returns the waypoints at each step, drawn again where they are reached or due."""
-        position, step, every = steps.position, steps.step, self.config.redraw
+        position, step, every = steps.get(keys.POSITION), steps.get(keys.STEP), self.config.redraw
         # At step 0, `reset` has used the first key.
         use = Use.WAYPOINT + (step == 0) * (Use.FIRST_WAYPOINT_REDRAW - Use.WAYPOINT)
-        key = counter_rng.step_key(steps.rng_key, step, use)
+        key = counter_rng.step_key(steps.get(keys.RNG_KEY), step, use)
         points = motion.random_points(key, position.shape[-2], self.low, self.high)
         due = (step % every == 0)[..., None, None] & wanders if every else wanders & False
         waypoints = []
@@ -310,24 +289,24 @@ class Consensus(CommModule):
         return torch.stack(waypoints)
 
     def _bonus(
-        self, steps: TimeSteps, discovers: Tensor, follows: Tensor, target: Tensor
+        self, steps: TensorDictBase, discovers: Tensor, follows: Tensor, target: Tensor
     ) -> Tensor | None:
         """Returns the heading term, float32 [steps, num_envs, n]; 0 for a UAV that left the box.
 
         It depends on the positions, targets and roles of the step before, which are stored.
         """
-        heading, after = self.config.heading, steps.position
+        heading, after = self.config.heading, steps.get(keys.POSITION)
         if not heading.weight and not heading.circle:
             return None
         before = self._before(self.position, after), after, self._before(self.target, target)
         term = heading_reward(*before, heading)
         if heading.circle:
-            old_fire_only = discovers & (steps.new_fire == 0)
+            old_fire_only = discovers & (steps.get(keys.NEW_FIRE) == 0)
             circles = self._before(self.old_fire_only, old_fire_only)
             term = torch.where(circles, heading.circle * circling(*before), term)
         if not self.config.wander:
             term = term.masked_fill(self._before(self.leaderless, follows < 0), 0.0)
-        left = left_box(steps.hit_boundary, self.world.reward.exit_axes)
+        left = left_box(steps.get(keys.HIT_BOUNDARY), self.world.reward.exit_axes)
         return term.masked_fill(left, 0.0)
 
     @staticmethod
@@ -337,12 +316,12 @@ class Consensus(CommModule):
         kept.copy_(now[-1])
         return before
 
-    def _jittered(self, steps: TimeSteps, target: Tensor) -> Tensor:
+    def _jittered(self, steps: TensorDictBase, target: Tensor) -> Tensor:
         """Adds clipped noise to x and y of targets closer than 1, within the box."""
-        key = counter_rng.step_key(steps.rng_key, steps.step, Use.TARGET_JITTER)
+        key = counter_rng.step_key(steps.get(keys.RNG_KEY), steps.get(keys.STEP), Use.TARGET_JITTER)
         noise = counter_rng.normal(key, 2 * target.shape[-2]).unflatten(-1, (-1, 2))
         noise = (self.config.jitter * noise).clamp(-1, 1)
-        near = motion.distance(steps.position, target) < 1
+        near = motion.distance(steps.get(keys.POSITION), target) < 1
         moved = target + torch.nn.functional.pad(noise, (0, 1)) * near[..., None]
         return moved.clamp(self.low.float(), self.high.float())
 

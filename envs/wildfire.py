@@ -282,10 +282,10 @@ class WildfireEnv(EnvBase):
         steer: Callable[[TensorDictBase], TensorDictBase] | None,
         communicate: Callable[..., tuple[TensorDictBase, dict[Any, Tensor]]],
     ) -> None:
-        """Calls `steer` on the action before every step, and `communicate` on time steps.
+        """Calls `steer` on the action before every step, and `communicate` on successive steps.
 
-        `communicate` returns the last time step, and the tensors that it changed in all of them,
-        [steps, num_envs, ...].
+        It gets the steps, batch size [steps, num_envs], and the last one. It returns that, and the
+        tensors that it changed in all of them, [steps, num_envs, ...].
         """
         self._steer, self._communicate = steer, communicate
 
@@ -300,10 +300,9 @@ class WildfireEnv(EnvBase):
             steered = chosen if self._steer is None else self._steer(chosen.copy())
             steps = self._snapshot(self._advance(steered.get(keys.ACTION), len(ahead)))
             parts.append(steps.select(*metrics.counted(self.config)))
-            if self._communicate is None:
-                result = steps[-1]
-            else:
-                result, changed = self._communicate(steps.unbind(0))
+            result = steps[-1]
+            if self._communicate is not None:
+                result, changed = self._communicate(steps, result)
                 parts[-1].update(changed)
         # [envs, steps], as the time steps of a rollout are
         series: Any = torch.cat(parts).transpose(0, 1).contiguous()
