@@ -38,19 +38,27 @@ def refused(path, match, **keys):
     assert len(text) < 700
 
 
-@pytest.fixture
-def wholes(tmp_path):
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
     """Writes a valid file of each format."""
+    folder = tmp_path_factory.mktemp("wholes")
     times, frame = raster_of(FIRE, 300.0, cells=40, cell=75.0), frame_of(FIRE, TIMES)
-    write_asc(tmp_path / "fire.asc", times, 75.0)
-    write_tif(tmp_path / "fire.tif", times.astype("float32"), 75.0)
-    np.save(tmp_path / "bank.npy", np.where(times < 0, np.inf, times / 6).astype("f4")[None])
+    write_asc(folder / "fire.asc", times, 75.0)
+    write_tif(folder / "fire.tif", times.astype("float32"), 75.0)
+    np.save(folder / "bank.npy", np.where(times < 0, np.inf, times / 6).astype("f4")[None])
     for suffix in ("shp", "geojson", "gpkg"):
-        frame.to_file(tmp_path / f"front.{suffix}")
-    frame.to_crs("EPSG:4326").to_file(tmp_path / "front.kml", driver="LIBKML")
-    with zipfile.ZipFile(tmp_path / "front.kmz", "w") as archive:
-        archive.write(tmp_path / "front.kml", "DOC.KML")
-    (tmp_path / "front.txt").write_text(points_text(FIRE, 6040, points=24))
+        frame.to_file(folder / f"front.{suffix}")
+    frame.to_crs("EPSG:4326").to_file(folder / "front.kml", driver="LIBKML")
+    with zipfile.ZipFile(folder / "front.kmz", "w") as archive:
+        archive.write(folder / "front.kml", "DOC.KML")
+    (folder / "front.txt").write_text(points_text(FIRE, 6040, points=24))
+    return folder
+
+
+@pytest.fixture
+def wholes(written, tmp_path):
+    """Returns copies of the valid files, which a test may damage."""
+    shutil.copytree(written, tmp_path, dirs_exist_ok=True)
     beside = (".dbf", ".shx", ".prj", ".cpg")
     return {p.suffix: p for p in sorted(tmp_path.iterdir()) if p.suffix not in beside}
 
