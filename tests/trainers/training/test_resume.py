@@ -15,15 +15,15 @@ from emberlink.trainers.runs.run_folder import BEST, METRICS, NEWEST, RunFolder
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Progress, Trainer
 
-HORIZON, EPISODES = 20, 4
+HORIZON, EPISODES = 10, 4
 SMALL = [
     *(f"env.horizon={HORIZON}", f"episodes={EPISODES}", "env.num_uavs=2", "num_envs=2"),
     *("learner.hidden=[8,8]",),
     *("evaluation.interval=0", "evaluation.interval_episodes=1", "evaluation.episodes=1"),
     "evaluation.scripted=[]",
 ]
-# A replay buffer of 60 rows is full after 30 of the 80 steps.
-REPLAY = ["learner.batch_size=16", "learner.buffer_size=60"]
+# A replay buffer of 30 rows is full after 15 of the 40 steps.
+REPLAY = ["learner.batch_size=16", "learner.buffer_size=30"]
 GRU = ["policy.memory=gru", "policy.units=6"]
 FEW = ["learner.epochs=2", "learner.minibatches=2"]
 LEARNERS = {
@@ -31,7 +31,7 @@ LEARNERS = {
     "td3": ["learner=td3", *REPLAY, "learner.critic=team"],
     "ippo": ["learner=ippo", *FEW, *GRU, "learner.share_parameters=false"],
     "mappo": ["learner=mappo", *FEW, *GRU, "learner.critic_map=true"],
-    "imitation": ["learner=imitation", "learner.samples=8", "learner.buffer_size=60"],
+    "imitation": ["learner=imitation", "learner.samples=8", "learner.buffer_size=30"],
 }
 
 
@@ -92,12 +92,12 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize(
     ("method", "learner", "steps"),
     [
-        ("independent", "ddpg", [1, 33]),
-        ("consensus", "ippo", [20, 60]),
-        ("maps", "imitation", [33, 40, 79]),
-        pytest.param("maps", "ddpg", [1, 33, 79], marks=pytest.mark.heavy),
+        ("independent", "ddpg", [1, 17]),
+        ("consensus", "ippo", [10, 30]),
+        ("maps", "imitation", [17, 20, 39]),
+        pytest.param("maps", "ddpg", [1, 17, 39], marks=pytest.mark.heavy),
         *(
-            pytest.param(method, learner, [20, 40], marks=pytest.mark.heavy)
+            pytest.param(method, learner, [10, 20], marks=pytest.mark.heavy)
             for method in METHODS
             for learner in LEARNERS
             if learner != "imitation"
@@ -134,7 +134,7 @@ MAP = ["env.observation=map"]
 )
 def test_messages_maps_and_the_sensor_are_resumed(method, more, whole, tmp_path):
     more = [*FRONT, *more]
-    assert_same(whole(method, *more), stopped_at([6, 20, 34], method, tmp_path, *more))
+    assert_same(whole(method, *more), stopped_at([4, 10, 18], method, tmp_path, *more))
 
 
 LATE = ["env.radio.delay=5", "env.radio.bandwidth=200", "env.radio.loss=0.3", "env.radio.burst=4.0"]
@@ -144,32 +144,32 @@ LATE = ["env.radio.delay=5", "env.radio.bandwidth=200", "env.radio.loss=0.3", "e
 def test_messages_in_flight_are_resumed(method, whole, tmp_path):
     more = [*REPLAY, *LATE, "env.base=[3, 3]", "env.measures=all", "env.radio.range=60"]
     more += ["env.map.pixels=8"] if method == "maps" else []
-    assert_same(whole(method, *more), stopped_at([7, 33, 61], method, tmp_path, *more))
+    assert_same(whole(method, *more), stopped_at([7, 17, 31], method, tmp_path, *more))
 
 
 def test_held_actions_failures_and_evaluations_are_resumed(whole, tmp_path):
     more = *REPLAY, "policy.hold=2", "env.failures=1", "evaluation.interval=2", "checkpoint_steps=7"
-    assert_same(whole("consensus", *more), stopped_at([10, 46, 60], "consensus", tmp_path, *more))
+    assert_same(whole("consensus", *more), stopped_at([6, 22, 30], "consensus", tmp_path, *more))
 
 
 def test_what_a_killed_process_left_is_removed(whole, tmp_path):
     trainer = begun("positional", tmp_path, *REPLAY, "checkpoint_steps=7")
 
     def die(progress: Progress) -> None:
-        if progress.step == 61:
+        if progress.step == 31:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         trainer.train(die)
     trainer.close()
     run = trainer.run
-    assert len(run.metrics()) == 3  # the checkpoint is of step 56, within the third episode
+    assert len(run.metrics()) == 3  # the checkpoint is of step 28, within the third episode
     (run.path / f"{NEWEST}.17.part").write_bytes(b"half a file")
     (run.path / ".tmpQ3x9Zk").write_bytes(b"half a file of safetensors'")
     (run.path / METRICS).open("a").write('{"episode": 4, "upd')
     (run.path / "thesis.part").write_text("mine")
     again = resume(run.path)
-    assert (again.setup.step, len(run.metrics())) == (56, 2)
+    assert (again.setup.step, len(run.metrics())) == (28, 2)
     left = {path.name for path in run.path.iterdir()}
     assert left == {
         *("config.yaml", METRICS, NEWEST, BEST, "lock", "thesis.part"),
@@ -178,7 +178,7 @@ def test_what_a_killed_process_left_is_removed(whole, tmp_path):
 
 
 def test_a_run_without_a_checkpoint_begins_again(whole, tmp_path):
-    run = until(begun("consensus", tmp_path, *REPLAY), 30).run
+    run = until(begun("consensus", tmp_path, *REPLAY), 15).run
     run.newest.unlink()
     again = resume(run.path)
     assert (again.setup.step, run.metrics()) == (0, [])
@@ -201,12 +201,12 @@ def test_additional_episodes_equal_those_of_a_longer_run(whole, tmp_path):
 
 @pytest.fixture(scope="module")
 def _paused(tmp_path_factory) -> Path:
-    return until(begun("consensus", tmp_path_factory.mktemp("paused"), *REPLAY), 30).run.path
+    return until(begun("consensus", tmp_path_factory.mktemp("paused"), *REPLAY), 15).run.path
 
 
 @pytest.fixture
 def paused(_paused, tmp_path) -> Path:
-    """Returns a copy of a run that was stopped at step 30."""
+    """Returns a copy of a run that was stopped at step 15."""
     return Path(shutil.copytree(_paused, tmp_path / "paused"))
 
 
@@ -218,7 +218,7 @@ def test_the_command_resumes_and_reports_a_finished_run(paused, whole, capsys):
     refused(["train", "positional", f"resume={paused}"], capsys, "is of method 'consensus'")
     (paused / "config.yaml").write_text("learner: edited\n")  # the checkpoint holds the settings
     assert main.main(["train", "consensus", f"resume={paused}", "evaluation.episodes=2"]) == 0
-    assert "resumed at step 30 of 80" in capsys.readouterr().out
+    assert "resumed at step 15 of 40" in capsys.readouterr().out
     uninterrupted = (whole("consensus", *REPLAY).run.path / METRICS).read_bytes()
     assert (paused / METRICS).read_bytes() == uninterrupted
     before = contents(paused)
