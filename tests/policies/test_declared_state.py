@@ -1,7 +1,7 @@
 """Tests that the memory and held actions of a policy survive in somebody else's loop."""
 
 import warnings
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +33,7 @@ def config_of(name):
     return resolve(method, given, **short)
 
 
+@cache
 def policy_of(name):
     """Returns actors with random weights that move the UAVs, frozen."""
     config = config_of(name)
@@ -47,6 +48,7 @@ def make(config, seed):
     return make_env(config, num_envs=1, seed=seed)
 
 
+@cache
 def alone(policy):
     """Returns the actions of two environments, each in a separate rollout."""
     runs = [

@@ -57,7 +57,7 @@ def test_environments_decide_at_their_own_steps():
 
 
 LOST = ["env.failures=2.0", "env.radio.loss=0.3", "env.measures=all", "fire.burn_time=15.0"]
-BASED = ["world=blackout", "env.horizon=60", "env.grid=[24, 24]", "env.base=[3.0, 12.0]"]
+BASED = ["world=blackout", "env.horizon=40", "env.grid=[24, 24]", "env.base=[3.0, 12.0]"]
 BURSTS = ["env.radio.burst=5.0", "env.radio.fade=true", "env.radio.shared=true"]
 METHODS = ["independent", "positional", "consensus", "maps"]
 WORLDS = {
@@ -73,7 +73,7 @@ WORLDS = {
 
 def make_pair(method: str, hold: int, options: list[str]):
     """Returns environments that are stepped one by one, and ones that hold their actions."""
-    fires = ["setup=strong", "fire=front", "fire.num_train_fires=3", "env.horizon=60"]
+    fires = ["setup=strong", "fire=front", "fire.num_train_fires=3", "env.horizon=40"]
     small = f"policy.hold={hold}", "env.map.pixels=8"
     config = resolve(method, [*fires, *options, *small])
     envs = []
@@ -99,7 +99,7 @@ def test_a_held_action_equals_its_steps_one_by_one(method, world):
     single, holding = make_pair(method, hold, options)
     generator, decisions, ends = torch.Generator().manual_seed(hold), [], 0
     now, later, steps = single.reset(), holding.reset(), []
-    for _ in range(90 // hold):
+    for _ in range(60 // hold):
         action = 3 * torch.rand(3, 6, 3, generator=generator) - 1.5
         for step in range(hold):
             done, now = single.step_and_maybe_reset(now.set(keys.ACTION, action.clone()))
@@ -134,7 +134,7 @@ def test_a_held_action_equals_its_steps_one_by_one(method, world):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_specs_of_environments_that_hold_actions(method):
-    check_env_specs(make_pair(method, 3, LOST)[1])
+    check_env_specs(make_pair(method, 4, LOST)[1])
 
 
 @pytest.mark.parametrize("learner", ["ddpg", "td3", "ippo"])

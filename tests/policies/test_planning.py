@@ -18,9 +18,12 @@ NEVER = math.inf
 BASE = torch.tensor([0.0, 30.0])
 
 
-def played(env, policy, steps: int, position=None):
+def played(env, policy, steps: int, position):
     """Returns the last time step of an episode."""
-    td = env.reset() if position is None else env.reset(position=torch.tensor(position))
+    return flown(env, policy, steps, env.reset(position=torch.tensor(position)))
+
+
+def flown(env, policy, steps: int, td):
     for _ in range(steps):
         td = step_mdp(env.step(policy(td)), keep_other=True)
     return td
@@ -86,20 +89,26 @@ NEAR_IT = [[26.0, 20, 4], [25.0, 22, 4], [28.0, 18, 4]]
 @pytest.mark.parametrize("kind", [Courier, Oracle])
 def test_what_was_seen_is_at_the_base_in_the_end(kind):
     env = WildfireEnv(1, base_world(), FAR_FIRE, seed=1)
-    td = played(env, kind(env), 60, NEAR_IT)
+    policy = kind(env)
+    td = played(env, policy, 60, NEAR_IT)
     assert td[keys.BASE_SEEN].item() == 0
-    td = played(env, kind(env), 90, NEAR_IT)
+    td = flown(env, policy, 30, td)
     assert td[keys.BASE_SEEN].item() == td[keys.SEEN].item() == 63
-    td = played(env, MapGreedy(env), 90, NEAR_IT)
-    assert td[keys.BASE_SEEN].item() == 0
 
 
-@pytest.mark.parametrize("kind", [Shuttle, ShuttleAll, OracleShuttle])
-def test_shuttles_report_in_the_middle_of_an_episode(kind):
+def test_who_does_not_report_leaves_the_base_without_news():
+    env = WildfireEnv(1, base_world(), FAR_FIRE, seed=1)
+    assert played(env, MapGreedy(env), 90, NEAR_IT)[keys.BASE_SEEN].item() == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "seen"), [(Shuttle, 63), (ShuttleAll, 63), (OracleShuttle, 63), (Courier, 0)]
+)
+def test_shuttles_report_in_the_middle_of_an_episode(kind, seen):
     env = WildfireEnv(1, base_world(horizon=300), FAR_FIRE, seed=1)
     td = played(env, kind(env), 250, NEAR_IT)
-    assert td[keys.BASE_SEEN].item() == td[keys.SEEN].item() == 63
-    assert played(env, Courier(env), 250, NEAR_IT)[keys.BASE_SEEN].item() == 0
+    assert td[keys.BASE_SEEN].item() == seen
+    assert td[keys.SEEN].item() == 63
 
 
 def test_the_chain_closes_where_a_uav_has_failed():

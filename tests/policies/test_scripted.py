@@ -173,7 +173,7 @@ def fires(shape, count: int):
 @functools.cache
 def world_of(name: str):
     """Returns the configuration of a world with a short horizon."""
-    return resolve("consensus", ["setup=tuned", f"world={name}", "env.horizon=12"])
+    return resolve("consensus", ["setup=tuned", f"world={name}", "env.horizon=8"])
 
 
 @pytest.mark.parametrize("place", [name for name in known("world") if name != "file"])
@@ -185,7 +185,7 @@ def test_every_policy_in_every_world(name, place):
 
     def actions(seeds, fire):
         env = build_env(config, num_envs=len(seeds), fire=fire, seed=seeds, device="cpu")
-        tds = episode(env, SCRIPTED.find(name)(env.base_env), 12)
+        tds = episode(env, SCRIPTED.find(name)(env.base_env), 8)
         if name != "random_actions":  # policies that fly to points in the box do not leave it
             assert not any(td[keys.HIT_BOUNDARY].any() for td in tds)
         return torch.stack([td[keys.ACTION] for td in tds])

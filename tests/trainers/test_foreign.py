@@ -230,18 +230,13 @@ def check_same_actions(policy, onnx: OnnxPolicy, steps: int, num_envs: int = 2, 
     assert decision.outputs[0] == "action"
 
 
+@pytest.mark.slow  # torch.onnx takes 10 seconds; test_own_learner.py exports a file in one
 @pytest.mark.parametrize(
     "settings",
     [
         {"policy.message": "attention", "share_parameters": True},
-        pytest.param(
-            {"policy.message": "mean", "observation": "map", "share_parameters": True},
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            {"memory": "none", "share_parameters": False, "observation": "window"},
-            marks=pytest.mark.slow,
-        ),
+        {"policy.message": "mean", "observation": "map", "share_parameters": True},
+        {"memory": "none", "share_parameters": False, "observation": "window"},
     ],
     ids=lambda settings: "-".join(map(str, settings.values())),
 )

@@ -306,10 +306,10 @@ def test_times_outside_the_features(tmp_path, place):
 
 @pytest.mark.parametrize("suffix", ["gpkg", pytest.param("geojson", marks=pytest.mark.heavy)])
 @pytest.mark.filterwarnings("ignore")
-def test_a_fire_of_28110_detections(tmp_path, suffix):
+def test_a_fire_of_8000_detections(tmp_path, suffix):
     random = np.random.default_rng(0)
-    passes = np.sort(random.integers(0, 76, 28110))
-    angle, far = random.uniform(0, 2 * np.pi, 28110), random.uniform(0.5, 1, 28110) * passes * 200
+    passes = np.sort(random.integers(0, 76, 8000))
+    angle, far = random.uniform(0, 2 * np.pi, 8000), random.uniform(0.5, 1, 8000) * passes * 200
     x, y = far * np.cos(angle) * 1.4 + CORNER[0], far * np.sin(angle) + CORNER[1]
     stamps = [pandas.Timestamp("2020-09-05T09:42") + pandas.Timedelta(hours=12 * k) for k in passes]
     points = geopandas.GeoSeries(geopandas.points_from_xy(x, y), crs=UTM).to_crs("EPSG:4326")

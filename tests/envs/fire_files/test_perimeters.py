@@ -34,8 +34,7 @@ def write(path, shapes, minutes):
 
 
 @pytest.mark.parametrize("name", FIRES)
-@pytest.mark.parametrize("grid", [(30, 30), (48, 36)])
-@pytest.mark.parametrize("first", [60, 180])
+@pytest.mark.parametrize(("grid", "first"), [((30, 30), 60), ((48, 36), 180)])
 def test_a_fire_is_the_same_from_its_raster_and_from_its_perimeters(tmp_path, name, grid, first):
     """All half-hourly perimeters from 60 minutes on, or the span from 180 to 360 minutes."""
     fire, span = FIRES[name], {"start": 180.0, "end": 360.0} if first == 180 else {}

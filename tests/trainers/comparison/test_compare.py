@@ -318,12 +318,12 @@ def test_the_report_is_one_page(runs, tmp_path, capsys):
     assert content["settings"]["resamples"] == 10_000
 
 
-def test_extras(runs, tmp_path):
+def test_extras(runs, comparison, tmp_path):
     out = tmp_path / "out"
     extras = ["--csv", "--latex", "--marl-eval", "--svg"]
     assert main.main(["compare", str(runs), "--output", str(out), *extras]) == 0
     assert len(list(out.glob("*.svg"))) == 6
-    table, expected = pd.read_csv(out / "compare.csv").fillna(""), compare_runs([runs]).table
+    table, expected = pd.read_csv(out / "compare.csv").fillna(""), comparison.table
     pd.testing.assert_frame_equal(table, expected, check_dtype=False, check_exact=False)
     assert r"consensus & 3* & 60.0 & [50.0, 70.0]" in (out / "compare.tex").read_text()
     (tasks,) = json.loads((out / "marl_eval.json").read_text()).values()
@@ -354,15 +354,16 @@ def test_names_from_files_are_escaped(tmp_path, capsys):
     assert all(file.parent == tmp_path / "out" for file in (tmp_path / "out").rglob("*"))
 
 
-def test_nothing_is_overwritten(runs, tmp_path, monkeypatch, capsys):
+def test_nothing_is_overwritten(tmp_path_factory, tmp_path, monkeypatch, capsys):
+    run = write_run(tmp_path_factory.mktemp("one"))
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "mine").write_text("x")
     (tmp_path / "link").symlink_to("nowhere")
     monkeypatch.chdir(tmp_path)
     for output in ("taken", "taken/mine", "taken/mine/sub", "link", "x" * 300):
-        refused(["compare", runs, "--output", output], capsys, f"output {output}: ")
+        refused(["compare", run, "--output", output], capsys, f"output {output}: ")
     for name in ("compare", "compare_2"):
-        assert main.main(["compare", str(runs)]) == 0
+        assert main.main(["compare", str(run)]) == 0
         assert capsys.readouterr().out.rstrip().splitlines()[-1] == f"{name}/compare.html"
     assert {file.name for file in tmp_path.iterdir()} == {"compare", "compare_2", "taken", "link"}
     assert [file.name for file in (tmp_path / "taken").iterdir()] == ["mine"]

@@ -84,7 +84,7 @@ def test_a_radio_of_the_run_holds_for_the_methods_of_scripted_policies_too():
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
-    alone = "evaluation.scripted=[]", f"output={folder}"
+    alone = "evaluation.scripted=[]", "env.horizon=8", f"output={folder}"
     assert main(["train", "independent", "setup=tuned", *TINY, *alone]) == 0
     (path,) = folder.iterdir()
     return path

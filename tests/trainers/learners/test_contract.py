@@ -32,7 +32,9 @@ CASES = {
         *("learner=ddpg", "learner.batch_size=8", "env.observation=window"),
         *("learner.share_parameters=true", "env.failures=1"),
     ],
-    "td3": ["learner=td3", "policy.agent_index=true", "learner.batch_size=8", *MAP],
+    "td3": [
+        *("learner=td3", "policy.agent_index=true", "policy.hold=2", "learner.batch_size=8", *MAP),
+    ],
     "td3-team": [
         *("learner=td3", "learner.critic=team", "learner.batch_size=8"),
         "learner.share_parameters=true",
@@ -47,7 +49,7 @@ CASES = {
     "imitation": ["learner=imitation", "policy.hold=5", "learner.samples=8", *MAP],
     "imitation-gru": [
         *("learner=imitation", "policy.memory=gru", "policy.hold=2", "learner.samples=8"),
-        *("learner.sequence=4", "policy.message=mean", "policy.message_size=4"),
+        *("learner.sequence=4", "policy.message=mean", "policy.message_size=4", *MAP),
     ],
 }
 IN_CI = {"ddpg", "td3", "ippo", "mappo", "imitation-gru"}
