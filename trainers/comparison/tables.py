@@ -128,8 +128,8 @@ def named(names: Frame, settings: Frame) -> Frame:
 def telling_apart(settings: Frame) -> list[str]:
     """Returns keys that tell distinct rows apart; none that follows from those before it."""
     keys: list[str] = []
-    parts = 1
-    for key in sorted(settings.columns, key=lambda key: (key not in _FIRST, key == WARM_START)):
+    parts, varied = 1, settings.columns[settings.nunique() > 1]
+    for key in sorted(varied, key=lambda key: (key not in _FIRST, key == WARM_START)):
         if (more := len(settings[[*keys, key]].drop_duplicates())) > parts:
             keys, parts = [*keys, key], more
     return keys
