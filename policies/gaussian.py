@@ -15,16 +15,17 @@ from emberlink.policies.state import Stateful, written
 MEAN = (keys.AGENTS, "mean")
 """float32 [..., 3]: means of the actions"""
 MEMORY = (keys.AGENTS, "memory")
-"""float32 [..., size]: state of the actors' memory, carried from decision to decision"""
+"""float32 [..., size]: state of the actors' memory, and their messages in flight, carried from
+decision to decision"""
 LOG_PROB = (keys.AGENTS, "action_log_prob")
 """float32 [...]: logarithm of the probability density of the drawn action"""
 
 
 class GaussianActor(Stateful):
-    """Writes the mean action of each UAV, clipped to [-1, 1], and the new state of its memory.
+    """Writes the mean action of each UAV, clipped to [-1, 1], and its new state.
 
     Args:
-        network: the actors of all UAVs; its `step` gives mean actions and the memory's state.
+        network: the actors of all UAVs; its `step` gives mean actions and the state.
         observation_spec: of the environment.
     """
 
@@ -34,7 +35,7 @@ class GaussianActor(Stateful):
         self.observed = keys.observation_keys(observation_spec)
         if network.messages is not None:
             self.observed.append(keys.HEARS)
-        size = network.memory.size
+        size = network.size
         self.uavs, self.carries = network.grouping.uavs, {MEMORY: size} if size else {}
         reads: list[Any] = [*self.observed, *([keys.STEP, MEMORY] if size else [])]
         writes: list[Any] = [keys.ACTION, *([written(MEMORY)] if size else [])]

@@ -12,7 +12,7 @@ from emberlink.envs.scenarios import ScenarioConfig, grid_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.hold import held
-from emberlink.policies.networks.messages import message_bytes
+from emberlink.policies.networks.messages import message_bytes, message_lag
 from emberlink.policies.state import primer_of
 from emberlink.trainers.config.compose import override, resolve
 from emberlink.trainers.config.schema import RunConfig, build_comm
@@ -60,7 +60,8 @@ def make_env(
         raise UserError("expected a method, a setup and a world, or a RunConfig alone")
     fire = config.fire if fire is None else fire
     env = build_env(config, num_envs=num_envs, fire=fire, seed=seed, device=device)
-    if config.policy.memory != "none" or config.policy.hold > 1:
+    policy = config.policy
+    if policy.memory != "none" or policy.hold > 1 or message_lag(policy, config.env.radio):
         # The state that the policies carry from step to step.
         env.append_transform(primer_of(build_actor(config, env)))
     return env
@@ -104,7 +105,8 @@ def build_actor(
     """
     learner = LEARNERS.find(config.learner.name)
     specs = env.observation_spec, env.full_action_spec
-    actor = learner.make_actor(config.learner, *specs, generator, config.policy)
+    lag = message_lag(config.policy, config.env.radio)
+    actor = learner.make_actor(config.learner, *specs, generator, config.policy, lag)
     return held(actor, config.policy.hold, config.env.num_uavs)
 
 

@@ -1,9 +1,10 @@
 """Messages that are learned: how UAVs make them, and how a UAV joins the messages that it hears.
 
 At a decision, each UAV makes a message from its features; the UAVs that hear it by the radio of the
-world read the message at the same decision. Numbers are rounded to 8 bits, with the gradient of the
+world read the message at the same decision or, where the radio is late (`env.radio.delay`), at the
+first decision at or after its arrival. Numbers are rounded to 8 bits, with the gradient of the
 number before (straight-through, Bengio et al. 2013). Gradients flow from the hearer to the weights
-of the speaker. A subclass of `Messages` is a new scheme.
+of the speaker, also to an earlier decision. A subclass of `Messages` is a new scheme.
 """
 
 import math
@@ -13,6 +14,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from emberlink.envs.config import RadioConfig
 from emberlink.envs.utils.plugins import Plugins
 from emberlink.policies.networks.grouping import Grouping
 from emberlink.policies.networks.layers import StackedLinear
@@ -39,20 +41,35 @@ class Messages(nn.Module):
 
     def __init__(self, grouping: Grouping, inputs: int, size: int, **start: Any):
         super().__init__()
-        self.grouping = grouping
+        self.grouping, self.numbers = grouping, size + self.key_size
         self.say = StackedLinear(grouping.groups, inputs, size, gain=1.0, **start)
+        if self.key_size:
+            self.key = StackedLinear(grouping.groups, inputs, self.key_size, gain=1.0, **start)
 
-    def forward(self, features: Tensor, hears: Tensor) -> Tensor:
-        """Returns what UAVs hear, [groups, rows, size]; 0 for a UAV that hears nobody.
+    def speak(self, features: Tensor, batch: torch.Size) -> tuple[Tensor, Tensor]:
+        """Returns the messages of UAVs, [envs, uavs, size], and their keys, [envs, uavs, key_size].
 
         Args:
             features: [groups, rows, inputs], see `Grouping.split`.
-            hears: bool [envs, uavs, uavs], whether a UAV (row) hears another one (column).
+            batch: [envs, uavs].
         """
-        batch = hears.shape[:2]
-        said = self.arrive(self.grouping.join(eight_bits(self.say(features)), batch))
-        weights = self.weights(features, hears).to(said.dtype)
-        return self.grouping.split(weights @ said, batch)
+        message = self.grouping.join(eight_bits(self.say(features)), batch)
+        if not self.key_size:
+            return message, message[..., :0]
+        return message, self.grouping.join(eight_bits(self.key(features)), batch)
+
+    def forward(self, features: Tensor, message: Tensor, key: Tensor, hears: Tensor) -> Tensor:
+        """Returns what UAVs hear, [groups, rows, size]; 0 for a UAV that hears nobody.
+
+        Args:
+            features: of the hearers, [groups, rows, inputs].
+            message, key: what arrives now, see `speak`.
+            hears: bool [envs, uavs, uavs], whether it arrives at a UAV (row) from another one
+                (column).
+        """
+        message, key = self.arrive(message), self.arrive(key)
+        weights = self.weights(features, key, hears).to(message.dtype)
+        return self.grouping.split(weights @ message, hears.shape[:2])
 
     def arrive(self, said: Tensor) -> Tensor:
         """Returns numbers that UAVs say, [envs, uavs, numbers], as others hear them: see `fault`.
@@ -66,17 +83,21 @@ class Messages(nn.Module):
         return said
 
     @abstractmethod
-    def weights(self, features: Tensor, hears: Tensor) -> Tensor:
+    def weights(self, features: Tensor, key: Tensor, hears: Tensor) -> Tensor:
         """Returns the weight of each message (column) for a UAV (row), [envs, uavs, uavs].
 
         It must be 0 where no message is heard.
+
+        Args:
+            features, hears: see `forward`.
+            key: of the messages, [envs, uavs, key_size].
         """
 
 
 class Mean(Messages):
     """Takes the mean of the messages that a UAV hears (CommNet, Sukhbaatar et al. 2016)."""
 
-    def weights(self, features: Tensor, hears: Tensor) -> Tensor:
+    def weights(self, features: Tensor, key: Tensor, hears: Tensor) -> Tensor:
         return hears / hears.sum(-1, keepdim=True).clamp(min=1)
 
 
@@ -91,13 +112,10 @@ class Attention(Messages):
 
     def __init__(self, grouping: Grouping, inputs: int, size: int, **start: Any):
         super().__init__(grouping, inputs, size, **start)
-        self.key = StackedLinear(grouping.groups, inputs, self.key_size, gain=1.0, **start)
         self.query = StackedLinear(grouping.groups, inputs, self.key_size, gain=1.0, **start)
 
-    def weights(self, features: Tensor, hears: Tensor) -> Tensor:
-        batch = hears.shape[:2]
-        key = self.arrive(self.grouping.join(eight_bits(self.key(features)), batch))
-        query = self.grouping.join(self.query(features), batch)
+    def weights(self, features: Tensor, key: Tensor, hears: Tensor) -> Tensor:
+        query = self.grouping.join(self.query(features), hears.shape[:2])
         scores = (query @ key.mT / math.sqrt(self.key_size)).masked_fill(~hears, -torch.inf)
         # A UAV that hears nobody has no softmax.
         return scores.masked_fill(~hears.any(-1, keepdim=True), 0.0).softmax(-1) * hears
@@ -117,3 +135,8 @@ def message_bytes(policy: PolicyConfig) -> int:
     if policy.message == "none":
         return 0
     return policy.message_size + MESSAGES.find(policy.message).key_size
+
+
+def message_lag(policy: PolicyConfig, radio: RadioConfig) -> int:
+    """Returns the decisions from saying a message to hearing it, 0 without messages."""
+    return 0 if policy.message == "none" else -(-radio.delay // policy.hold)

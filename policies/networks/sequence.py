@@ -38,6 +38,9 @@ class SequenceNetwork(nn.Module):
         speaks: whether the UAVs say the messages of `policy`, if it has any. What a UAV hears is
             then an input of its memory, and the links, bool [..., uavs, uavs], are the last tensor
             of an observation.
+        lag: decisions from saying a message to hearing it. The messages in flight, with the links
+            of the decision at which they were said, are carried like a memory: gradients flow
+            through them within a sequence, and those that begin it are constants.
         start: see `layers.Start`.
     """
 
@@ -52,6 +55,7 @@ class SequenceNetwork(nn.Module):
         gain: float,
         share_parameters: bool = True,
         speaks: bool = False,
+        lag: int = 0,
         **start: Any,
     ):
         super().__init__()
@@ -69,17 +73,21 @@ class SequenceNetwork(nn.Module):
             self.hidden.append(StackedLinear(groups, inputs, units, gain=math.sqrt(2), **start))
             inputs = units
         self.output = StackedLinear(groups, inputs, outputs, gain=gain, **start)
-        self.messages = None
+        self.messages, flying = None, 0
         if speaks:
             inputs = self.encoder.features + self.memory.size
             scheme = MESSAGES.find(policy.message)
             self.messages = scheme(self.grouping, inputs, policy.message_size, **start)
+            flying = lag * (self.messages.numbers + uavs)
+        self.size = self.memory.size + flying
+        """numbers per UAV that are carried from decision to decision; they are 0 before the first:
+        the state of the memory, and the messages and links in flight"""
 
     def forward(self, state: Tensor, *observations: Tensor) -> tuple[Tensor, Tensor]:
         """Maps sequences of decisions.
 
         Args:
-            state: of the memory before the first decision, [rows, uavs, size].
+            state: before the first decision, [rows, uavs, size].
             observations: [rows, decisions, uavs, ...] each.
 
         Returns:
@@ -92,56 +100,67 @@ class SequenceNetwork(nn.Module):
         arranged = [split(x.transpose(1, 2), batch) for x in (first, *others)]
         each = arranged[0].shape[1:3]
         encoded = self.encoder([x.flatten(1, 2) for x in arranged]).unflatten(1, each)
-        before = split(state, batch)
+        before, flying = state.split([self.memory.size, self.size - self.memory.size], -1)
+        before = split(before.contiguous(), batch)
         if self.messages is None:
             x, after = self.memory(encoded, before)
         else:
-            x, after = self._converse(self.messages, encoded, before, observations[-1])
+            given = self.messages, encoded, before, flying, observations[-1]
+            x, after, flying = self._converse(*given)
         x = x.flatten(1, 2)
         for layer in self.hidden:
             x = layer(x).tanh()
         output = self.output(x).unflatten(1, each)
         joined = join(output.flatten(2), batch).unflatten(-1, (decisions, -1))
-        return joined.transpose(1, 2), join(after, batch)
+        return joined.transpose(1, 2), torch.cat((join(after, batch), flying), -1)
 
     def step(self, observations: Sequence[Tensor], state: Tensor | None) -> tuple[Tensor, Tensor]:
         """Maps the observations of one decision.
 
         Args:
             observations: [*batch, uavs, ...] each.
-            state: [*batch, uavs, size], from the decision before; None for an empty memory.
+            state: [*batch, uavs, size], from the decision before; None for an empty state.
 
         Returns:
             Outputs, [*batch, uavs, outputs], and the new state, [*batch, uavs, size].
         """
         *batch, uavs = observations[0].shape[:-1]
         rows = math.prod(batch)
-        size = rows, uavs, self.memory.size
+        size = rows, uavs, self.size
         before = self.output.weight.new_zeros(size) if state is None else state.reshape(size)
         each = [x.reshape(rows, 1, *x.shape[len(batch) :]) for x in observations]
         output, after = SequenceNetwork.forward(self, before, *each)
-        return output.reshape(*batch, uavs, -1), after.reshape(*batch, uavs, self.memory.size)
+        return output.reshape(*batch, uavs, -1), after.reshape(*batch, uavs, self.size)
 
     def _converse(
-        self, messages: Messages, encoded: Tensor, state: Tensor, hears: Tensor
-    ) -> tuple[Tensor, Tensor]:
+        self, messages: Messages, encoded: Tensor, state: Tensor, flying: Tensor, hears: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Runs the memory decision by decision, since a UAV may say what it has heard before.
 
         Args:
             encoded: [groups, rows, decisions, features].
-            state: [groups, rows, size].
+            state: of the memory, [groups, rows, size].
+            flying: [envs, uavs, lag * (numbers + uavs)], of the decisions before, the oldest first:
+                the message of a UAV, and whether it hears each other one.
             hears: bool [envs, decisions, uavs, uavs].
         """
         features = []
         for now, links in zip(encoded.unbind(2), hears.unbind(1), strict=True):
-            heard = messages(torch.cat((now, state), -1), links)
+            mine = torch.cat((now, state), -1)
+            said = *messages.speak(mine, links.shape[:2]), links
+            if flying.shape[-1]:
+                sizes = [part.shape[-1] for part in said]
+                sent = torch.cat((flying, *said), -1).split((sum(sizes), flying.shape[-1]), -1)
+                (message, key, link), flying = sent[0].split(sizes, -1), sent[1]
+                said = message, key, link > 0
+            heard = messages(mine, *said)
             x, state = self.memory(torch.cat((now, heard), -1).unsqueeze(2), state)
             features.append(x)
-        return torch.cat(features, 2), state
+        return torch.cat(features, 2), state, flying
 
     def empty_state(self, rows: int) -> Tensor:
         """Returns the state before the first decision, [rows, uavs, size]."""
-        return self.output.weight.new_zeros(rows, self.grouping.uavs, self.memory.size)
+        return self.output.weight.new_zeros(rows, self.grouping.uavs, self.size)
 
 
 class GaussianNetwork(SequenceNetwork):

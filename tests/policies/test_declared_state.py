@@ -21,8 +21,9 @@ from emberlink.trainers.evaluation.policy import TrainedPolicy
 
 HORIZON, STEPS = 12, 24
 """two episodes"""
+LATE = ["policy.message=attention", "env.radio.delay=4"]
 CONFIGS = {
-    "gru": ("independent", ["learner=ippo", "policy.memory=gru", "policy.units=8"]),
+    "gru": ("independent", ["learner=ippo", "policy.memory=gru", "policy.units=8", *LATE]),
     "maps": ("maps", ["setup=tuned"]),
 }
 

@@ -7,25 +7,27 @@ import pytest
 import torch
 
 from emberlink.envs import keys
+from emberlink.envs.config import RadioConfig
 from emberlink.policies.gaussian import GaussianActor
-from emberlink.policies.networks.messages import message_bytes
-from emberlink.policies.networks.sequence import GaussianNetwork
+from emberlink.policies.networks.messages import message_bytes, message_lag
+from emberlink.policies.networks.sequence import GaussianNetwork, SequenceNetwork
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers import make_env
+from emberlink.trainers.build import build_actor
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.setup import TrainingSetup
 
 UAVS, FEATURES, SIZE, ENVS = 4, 6, 5, 2
 SCHEMES = ["mean", "attention"]
-CASES = list(itertools.product(SCHEMES, ["none", "gru"], [True, False]))
+CASES = list(itertools.product(SCHEMES, ["none", "gru"], [True, False], [0, 2]))
+CASE = "scheme", "memory", "shared", "lag"
 
 
-def network(scheme: str, memory: str = "gru", shared: bool = True, uavs=UAVS) -> Any:
+def network(scheme: str, memory: str = "gru", shared: bool = True, lag=0, uavs=UAVS) -> Any:
     policy = PolicyConfig(memory=memory, units=7, message=scheme, message_size=SIZE)
     start = torch.Generator().manual_seed(3)
-    made = GaussianNetwork(
-        uavs, [(FEATURES,)], 3, (8,), policy=policy, share_parameters=shared, generator=start
-    )
+    more = {"share_parameters": shared, "lag": lag, "generator": start}
+    made = GaussianNetwork(uavs, [(FEATURES,)], 3, (8,), policy=policy, **more)
     for weight in made.parameters():  # no zeros, and outputs that differ
         weight.data.add_(torch.randn(weight.shape, generator=start), alpha=0.3)
     return made.double()
@@ -48,11 +50,12 @@ class Twin:
 
     Args:
         net: the network.
+        lag: decisions from saying a message to hearing it.
         kept: rounding errors of an earlier pass, added instead of rounding anew.
     """
 
-    def __init__(self, net: Any, kept: list[torch.Tensor] | None = None):
-        self.net, self.kept, self.errors = net, kept, []
+    def __init__(self, net: Any, lag: int, kept: list[torch.Tensor] | None = None):
+        self.net, self.lag, self.kept, self.errors = net, lag, kept, []
 
     def row(self, uav: int) -> int:
         return 0 if self.net.grouping.shared else uav
@@ -82,8 +85,8 @@ class Twin:
         """Maps one environment, [decisions, uavs, features], to [decisions, uavs, 3]."""
         size, states, means = self.net.memory.size, None, []
         states = [observed.new_zeros(size) for _ in range(UAVS)]
-        said = self.net.messages
-        for x, heard in zip(observed, hears, strict=True):
+        said, sent = self.net.messages, []
+        for x, linked in zip(observed, hears, strict=True):
             mine = [torch.cat((x[u], states[u])) for u in range(UAVS)]
             message = [self.rounded(self.linear(said.say, u, mine[u])) for u in range(UAVS)]
             read = []
@@ -93,6 +96,9 @@ class Twin:
                 if attends
                 else []
             )
+            sent.append((message, key, linked))
+            nobody = [], [], torch.zeros(UAVS, UAVS)
+            message, key, heard = sent[-1 - self.lag] if len(sent) > self.lag else nobody
             for u in range(UAVS):
                 total = observed.new_zeros(SIZE)
                 others = [v for v in range(UAVS) if heard[u, v]]
@@ -115,13 +121,14 @@ class Twin:
         return torch.stack(means)
 
 
-@pytest.mark.parametrize(("scheme", "memory", "shared"), CASES)
-def test_means_and_gradients_equal_those_of_a_scalar_twin(scheme, memory, shared):
-    net, observed, hears = network(scheme, memory, shared), drawn(ENVS, 5, UAVS, FEATURES), links(5)
+@pytest.mark.parametrize(CASE, CASES)
+def test_means_and_gradients_equal_those_of_a_scalar_twin(scheme, memory, shared, lag):
+    net, hears = network(scheme, memory, shared, lag), links(5)
+    observed = drawn(ENVS, 5, UAVS, FEATURES)
     mean, _ = net(net.empty_state(ENVS), observed, hears)
     weights = [w for name, w in net.named_parameters() if name.startswith("messages")]
     for env in range(ENVS):
-        expected = Twin(net).means(observed[env], hears[env])
+        expected = Twin(net, lag).means(observed[env], hears[env])
         torch.testing.assert_close(mean[env], expected)
         gradients, others = (
             torch.autograd.grad(means[:, 2].sum(), weights, retain_graph=True)
@@ -133,10 +140,11 @@ def test_means_and_gradients_equal_those_of_a_scalar_twin(scheme, memory, shared
             assert gradients[0].abs().sum((1, 2)).count_nonzero() >= 2
 
 
-@pytest.mark.parametrize(("scheme", "memory", "shared"), CASES)
-def test_gradients_cross_uavs_as_finite_differences_say(scheme, memory, shared):
-    net, observed, hears = network(scheme, memory, shared), drawn(3, UAVS, FEATURES), links(3)[0]
-    first = Twin(net)
+@pytest.mark.parametrize(CASE, CASES)
+def test_gradients_cross_uavs_as_finite_differences_say(scheme, memory, shared, lag):
+    net, hears = network(scheme, memory, shared, lag), links(3)[0]
+    observed = drawn(3, UAVS, FEATURES)
+    first = Twin(net, lag)
     first.means(observed, hears)
     mean, _ = net(net.empty_state(1), observed[None], hears[None])
     weights = [w for name, w in net.named_parameters() if name.startswith("messages")]
@@ -147,7 +155,7 @@ def test_gradients_cross_uavs_as_finite_differences_say(scheme, memory, shared):
             outputs = []
             for step in (1e-6, -2e-6):
                 entry[index] += step
-                outputs.append(Twin(net, first.errors).means(observed, hears)[-1, 2].sum())
+                outputs.append(Twin(net, lag, first.errors).means(observed, hears)[-1, 2].sum())
             entry[index] += 1e-6
             slope = (outputs[0] - outputs[1]) / 2e-6
             torch.testing.assert_close(gradient.reshape(-1)[index], slope, rtol=1e-4, atol=1e-7)
@@ -155,9 +163,9 @@ def test_gradients_cross_uavs_as_finite_differences_say(scheme, memory, shared):
 
 @pytest.mark.parametrize("scheme", ["none", *SCHEMES])
 @pytest.mark.parametrize("memory", ["none", "gru"])
-@pytest.mark.parametrize("shared", [True, False])
-def test_decision_by_decision_equals_the_sequence(scheme, memory, shared):
-    net = network(scheme, memory, shared)
+@pytest.mark.parametrize("lag", [0, 3])
+def test_decision_by_decision_equals_the_sequence(scheme, memory, lag):
+    net = network(scheme, memory, lag=lag)
     given = [drawn(ENVS, 6, UAVS, FEATURES), links(6)][: 1 + (scheme != "none")]
     whole, std = net(net.empty_state(ENVS), *given)
     state = None
@@ -165,6 +173,57 @@ def test_decision_by_decision_equals_the_sequence(scheme, memory, shared):
         mean, state = net.step([each[:, k] for each in given], state)
         torch.testing.assert_close(mean, whole[:, k])
     assert std.equal(net.std(torch.Size((ENVS, UAVS)))[:, None].expand_as(whole))
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_late_message_crosses_only_the_link_that_it_was_sent_on(scheme):
+    """UAV 3 speaks at decision 1; who hears it then acts otherwise two decisions later."""
+    net, observed, hears = network(scheme, "none", lag=2), drawn(1, 6, UAVS, FEATURES), links(6)[:1]
+    other = observed.clone()
+    other[0, 1, 3] += 1
+    hears[0, 1, :, 3] = torch.tensor([True, False, True, False])
+    hears[0, 3, :, 3] = torch.tensor([False, True, False, False])
+    means = [net(net.empty_state(1), x, hears)[0][0] for x in (observed, other)]
+    changed = (means[0] != means[1]).any(-1)
+    expected = torch.zeros(6, UAVS, dtype=torch.bool)
+    expected[1, 3] = expected[3, 0] = expected[3, 2] = True
+    assert changed.equal(expected)
+
+
+def test_messages_in_flight_at_the_beginning_of_a_chunk_are_heard_and_are_constants():
+    net, observed, hears = network("mean", "none", lag=2), drawn(1, 4, UAVS, FEATURES), links(4)[:1]
+    before = net(net.empty_state(1), observed[:, :2], hears[:, :2])[0]
+    _, state = SequenceNetwork.forward(net, net.empty_state(1), observed[:, :2], hears[:, :2])
+    after = net(state.detach(), observed[:, 2:], hears[:, 2:])[0]
+    whole = net(net.empty_state(1), observed, hears)[0]
+    torch.testing.assert_close(torch.cat((before, after), 1), whole)
+    weight = net.messages.say.weight
+    assert torch.autograd.grad(whole.sum(), weight)[0].any()
+    assert not torch.autograd.grad(after.sum(), weight)[0].any()
+
+
+def test_a_late_message_is_heard_at_the_first_decision_at_or_after_its_arrival():
+    cases = {(0, 1): 0, (1, 1): 1, (7, 1): 7, (1, 5): 1, (5, 5): 1, (6, 5): 2}
+    for (delay, hold), lag in cases.items():
+        policy = PolicyConfig(message="mean", hold=hold)
+        assert message_lag(policy, RadioConfig(delay=delay)) == lag
+
+
+@pytest.mark.parametrize(("delay", "hold"), [(2, 1), (3, 2)])
+def test_a_team_hears_late_messages_by_the_links_of_their_decision(delay, hold):
+    """In a world with losses, actions equal those of a network that is shown all decisions."""
+    more = {"policy.hold": hold, "env.radio.delay": delay, "env.radio.loss": 0.4, "horizon": 12}
+    more |= {"policy.message": "attention", "policy.memory": "none", "env.radio.range": 20}
+    config = resolve("independent", ["setup=strong", "fire.num_train_fires=2"], **more)
+    env = make_env(config, num_envs=3, seed=0)
+    policy: Any = build_actor(config, env, torch.Generator().manual_seed(0))
+    policy.module.output.weight.data.mul_(100)
+    run = env.rollout(12, policy)[:, ::hold]
+    actor = policy if hold == 1 else policy.policy
+    observed = [run[key] for key in actor.observed]
+    assert not observed[-1].equal(observed[-1][:, :1].expand_as(observed[-1]))
+    mean, _ = actor.module(actor.module.empty_state(3), *observed)
+    torch.testing.assert_close(run[keys.ACTION], mean.clamp(-1, 1))
 
 
 def test_a_network_flies_teams_of_any_size():

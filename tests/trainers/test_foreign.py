@@ -235,6 +235,7 @@ def check_same_actions(policy, onnx: OnnxPolicy, steps: int, num_envs: int = 2, 
     "settings",
     [
         {"policy.message": "attention", "share_parameters": True},
+        {"policy.message": "attention", "memory": "none", "env.radio.delay": 7},
         {"policy.message": "mean", "observation": "map", "share_parameters": True},
         {"memory": "none", "share_parameters": False, "observation": "window"},
     ],
@@ -250,7 +251,7 @@ def test_an_onnx_file_acts_like_the_run(settings, tmp_path):
     )
     policy, onnx = exported(run.path, tmp_path)
     check_same_actions(policy, onnx, 40)
-    if settings["share_parameters"]:
+    if settings.get("share_parameters"):
         other = trainers.load(run.path, num_uavs=5)
         check_same_actions(other, onnx, 20, num_envs=3)
     card = json.loads((tmp_path / "policy.json").read_text())

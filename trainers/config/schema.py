@@ -100,13 +100,6 @@ class RunConfig(Basics):
             raise UserError(f"evaluation.headline={headline} {where}; known: {', '.join(known)}")
         return self
 
-    @model_validator(mode="after")
-    def _check_delay(self) -> "RunConfig":
-        delay, message = self.env.radio.delay, self.policy.message
-        if delay and message != "none":
-            raise UserError(f"env.radio.delay={delay}: policy.message={message} cannot be late")
-        return self
-
     @field_validator("policy")
     @classmethod
     def _check_memory(cls, value: PolicyConfig) -> PolicyConfig:

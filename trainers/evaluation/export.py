@@ -15,6 +15,7 @@ from torch.export import Dim
 from emberlink.envs.utils.atomic_io import created, new_file
 from emberlink.envs.utils.errors import UserError, require
 from emberlink.envs.utils.validation import shown
+from emberlink.policies.networks.messages import message_lag
 from emberlink.trainers.build import make_env
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
@@ -29,7 +30,7 @@ from emberlink.trainers.runs.run_folder import MAX_JSON, read_text
 MEANING = {
     "observation": "see env.observation_scale; the order of docs/environment.md",
     "step": "steps since the episode began; where it is 0, the memory begins empty",
-    "memory": "next_memory of the decision before; 0 at the first",
+    "memory": "next_memory of the decision before, late messages included; 0 at the first",
     "hears": "whether a UAV (row) hears another one (column) in this step",
     "crops": "pictures of each UAV's own map, bytes",
     "window": "cells around each UAV: new fire, old fire, no fire",
@@ -99,6 +100,7 @@ def _dynamic(config: RunConfig, tensor: Tensor) -> dict[int, Any]:
     shared, UAVs."""
     team, shared = config.env.num_uavs, config.learner.share_parameters
     grows = shared and not config.policy.agent_index and config.comm["name"] != "positional"
+    grows &= not message_lag(config.policy, config.env.radio)  # the links of the team in flight
     return {
         place: Dim.DYNAMIC
         for place, size in enumerate(tensor.shape[:3])

@@ -19,6 +19,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.utils.validation import STRICT, Name
 from emberlink.policies.networks.actor_critic import make_actor
+from emberlink.policies.networks.messages import message_lag
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.learners.tensors import (
     copy_into,
@@ -99,6 +100,11 @@ class LearnerContext:
     """whether UAVs can fail; losses leave out decisions after a failure, and if they use rewards,
     the decision of the failure"""
 
+    @property
+    def lag(self) -> int:
+        """Decisions from saying a learned message to hearing it."""
+        return message_lag(self.policy, self.world.radio)
+
 
 class Learner(ABC):
     """Trains the networks of all UAVs.
@@ -146,8 +152,9 @@ class Learner(ABC):
         action_spec: Composite,
         generator: torch.Generator | None = None,
         policy: PolicyConfig | None = None,
+        lag: int = 0,
     ) -> Any:
-        """Returns new actors.
+        """Returns new actors, whose messages are `lag` decisions late.
 
         Raises:
             UserError: the policy has a memory or messages, and the networks have none.

@@ -49,7 +49,7 @@ class ImitationConfig(LearnerConfig):
     buffer_size: Count
     """capacity of the replay buffer, in decisions of a UAV"""
     sequence: Count = 16
-    """successive decisions that a memory learns from at once"""
+    """successive decisions that a memory, and late messages, learn from at once"""
 
     @model_validator(mode="after")
     def _decisions_fit(self) -> "ImitationConfig":
@@ -69,7 +69,7 @@ class Imitation(Learner):
     the UAV's observations and the teacher's actions. The loss of an update is the smooth L1
     distance to the teacher's action.
 
-    With a memory, the replay buffer holds sequences of decisions, with the state of the memory
+    With a memory or late messages, the replay buffer holds sequences of decisions, with the state
     before the first one (Kapturowski et al. 2019, ICLR).
     """
 
@@ -79,14 +79,14 @@ class Imitation(Learner):
         self.config, self.context = config, context
         specs = context.observation_spec, context.action_spec
         initial = torch.Generator().manual_seed(context.seed)
-        self.actor = self.make_actor(config, *specs, initial, context.policy)
+        self.actor = self.make_actor(config, *specs, initial, context.policy, context.lag)
         self.loss: nn.Module = self.actor.module
         self.generator = torch.Generator(context.device).manual_seed(context.seed)
         self.explorer: Any = Mixture(self.actor, self.generator)
         self.observed = keys.observation_keys(context.observation_spec)
         speaks = context.policy.message != "none"
         self.observed += [keys.HEARS] if speaks else []
-        self.remembers = context.policy.memory != "none"
+        self.remembers = context.policy.memory != "none" or context.lag > 0
         self.sequence = min(config.sequence, context.horizon) if self.remembers else 1
         """decisions of a row of the replay buffer"""
         self.replay = TeamReplay(

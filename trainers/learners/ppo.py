@@ -4,7 +4,8 @@ IPPO's critic reads its UAV's observation (de Witt et al. 2020), MAPPO's the obs
 team (Yu et al. 2022, NeurIPS). The losses and the advantages are TorchRL's `MAPPOLoss` and
 `MultiAgentGAE`; its standardisation of advantages and its `ValueNorm` are not used, since both
 count decisions after the failure of a UAV. A memory learns from chunks of an episode, each from the
-state that was stored at its beginning (Yu et al. 2022, appendix A).
+state that was stored at its beginning (Yu et al. 2022, appendix A); so do late messages: those in
+flight when a chunk begins are constants, as they were said.
 """
 
 from abc import ABC, abstractmethod
@@ -70,7 +71,8 @@ class IPPOConfig(LearnerConfig):
     minibatches: Count
     """updates of a pass, each from other chunks"""
     chunk: Annotated[int, Field(ge=0, le=1_000_000)] = 0
-    """successive decisions through which gradients of a memory flow; 0 for whole episodes"""
+    """successive decisions through which gradients of a memory, and of late messages, flow; 0 for
+    whole episodes"""
     lr: Positive
     """learning rate of Adam at the beginning; it falls linearly to 0 at the end of the run"""
     gradient_norm: Positive
@@ -115,7 +117,7 @@ class PPO(Learner, ABC):
         # Networks.
         specs = context.observation_spec, context.action_spec
         initial = torch.Generator().manual_seed(context.seed)
-        self.actor = self.make_actor(config, *specs, initial, context.policy)
+        self.actor = self.make_actor(config, *specs, initial, context.policy, context.lag)
         self.critic: Any = self.make_critic(context, initial)
         self._reset_std()
         self.chunk = min(config.chunk or context.horizon, context.horizon)
@@ -162,6 +164,7 @@ class PPO(Learner, ABC):
         action_spec: Composite,
         generator: torch.Generator | None = None,
         policy: PolicyConfig | None = None,
+        lag: int = 0,
     ) -> GaussianActor:
         """Returns new actors, with a memory if the policy has one."""
         uavs, actions = action_spec[keys.ACTION].shape[-2:]
@@ -173,6 +176,7 @@ class PPO(Learner, ABC):
             config.hidden,
             policy=policy or PolicyConfig(),
             share_parameters=config.share_parameters,
+            lag=lag,
             device=device,
             generator=generator,
         )

@@ -44,12 +44,14 @@ CASES = {
     "mappo": [
         *("learner=mappo", *IPPO[1:], "policy.agent_index=true", "env.failures=1"),
         *("policy.message=attention", "policy.message_size=4", "learner.chunk=2"),
+        "env.radio.delay=1",
     ],
     "mappo-map": ["learner=mappo", "learner.critic_map=true", "policy.hold=4"],
     "imitation": ["learner=imitation", "policy.hold=5", "learner.samples=8", *MAP],
     "imitation-gru": [
         *("learner=imitation", "policy.memory=gru", "policy.hold=2", "learner.samples=8"),
         *("learner.sequence=4", "policy.message=mean", "policy.message_size=4", *MAP),
+        "env.radio.delay=3",
     ],
 }
 IN_CI = {"ddpg", "td3", "ippo", "mappo", "imitation-gru"}

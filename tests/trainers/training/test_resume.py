@@ -120,7 +120,7 @@ MAP = ["env.observation=map"]
 @pytest.mark.parametrize(
     ("method", "more"),
     [
-        ("independent", [*GRU, "policy.message=attention"]),
+        ("independent", [*GRU, "policy.message=attention", "env.radio.delay=5"]),
         ("maps", ["policy.message=mean"]),
         *(
             pytest.param(*case, marks=pytest.mark.heavy)
