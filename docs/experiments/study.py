@@ -2,7 +2,7 @@
 
     python docs/experiments/study.py list OUTPUT           # prints the commands
     python docs/experiments/study.py run OUTPUT            # runs them, and skips what is finished
-    python docs/experiments/study.py run OUTPUT front      # only those of some worlds
+    python docs/experiments/study.py run OUTPUT front/map  # only these arms of a world
 
 Each training is one process with one thread; one that was stopped is resumed.
 """
@@ -26,38 +26,34 @@ OF_IMITATION = [
 ]
 OF_MAP = [
     *("learner.gamma=0.95", "learner.gae_lambda=0.95", "learner.epochs=2", "learner.lr=5e-4"),
-    *("learner.log_std=-1.2", "num_envs=32", "episodes=40", "evaluation.interval=2"),
+    *("learner.log_std=-1.2", "num_envs=32", "episodes=80", "evaluation.interval=4"),
 ]
 ATTENTION = "policy.message=attention"
 EXCHANGES: dict[str, tuple[str, Sequence[str]]] = {
     "none": ("independent", []),
-    "attention": ("independent", [ATTENTION]),
     "maps": ("maps", []),
-    "consensus": ("consensus", []),
-    "maps_unlimited": ("maps", ["env.radio.range=.inf"]),
-    "positions": ("positional", []),
-    "mean": ("independent", ["policy.message=mean"]),
+    "attention": ("independent", [ATTENTION]),
     # As many bytes a step: a message and its key of 8 bytes are sent once in ten steps.
     "maps_16": ("maps", ["env.radio.bandwidth=16"]),
     "attention_16": ("independent", [ATTENTION, "policy.message_size=152"]),
-    "maps_64": ("maps", ["env.radio.bandwidth=64"]),
-    "attention_64": ("independent", [ATTENTION, "policy.message_size=632"]),
+    "maps_unlimited": ("maps", ["env.radio.range=.inf"]),
+    "consensus": ("consensus", []),
 }
 """name -> method and settings: all in which arms with the same observation differ"""
 ARMS: dict[str, dict[str, Sequence[str]]] = {
     "front": {
-        "vector": ("none", "attention", "consensus", "positions", "mean"),
-        "map": tuple(name for name in EXCHANGES if name not in ("positions", "mean")),
+        "map": ("none", "maps", "attention", "maps_16", "attention_16", "maps_unlimited"),
+        "vector": ("none", "attention", "consensus"),
     },
     "relay": {
+        "map": ("none", "maps", "attention", "maps_unlimited"),
         "vector": ("none", "attention"),
-        "map": ("none", "attention", "maps", "maps_unlimited"),
     },
     "paper": {"vector": ("none", "attention"), "map": ("none", "maps")},
     "swarm": {"map": ("none", "maps")},
 }
 """world -> observation -> exchanges"""
-MOST = "none", "attention", "maps", "consensus"
+MOST = "none", "maps", "attention", "consensus"
 """exchanges with 10 seeds in `front`; all others have 5"""
 
 
@@ -96,17 +92,17 @@ def _run(folder: Path, seed: int) -> Path:
     return next(folder.glob(f"*_s{seed}_*"), folder / f"RUN_s{seed}")
 
 
-def main(verb: str, output: str, *worlds: str) -> int:
+def main(verb: str, output: str, *parts: str) -> int:
     """Prints or runs all commands; returns how many failed."""
     failed = 0
-    for world in worlds or WORLDS:
+    for world in WORLDS:
+        chosen = [arm for arm in arms(world) if f"{world}/{arm[0]}".startswith(parts or "")]
         scripted = Path(output) / world / "scripted.json"
         scripted.parent.mkdir(parents=True, exist_ok=True)
         check = ["world", "check", world, "setup=strong", *WORLDS[world], "--json", str(scripted)]
-        of_arms = (line for arm in arms(world) for line in commands(Path(output), world, *arm))
-        if not scripted.exists() and world != "paper":
+        if chosen and not scripted.exists() and world != "paper":
             failed += _do(verb, check)
-        for line in of_arms:
+        for line in (line for arm in chosen for line in commands(Path(output), world, *arm)):
             failed += _do(verb, line)
     return failed
 
