@@ -26,7 +26,7 @@ OF_IMITATION = [
 ]
 OF_MAP = [
     *("learner.gamma=0.95", "learner.gae_lambda=0.95", "learner.epochs=2", "learner.lr=5e-4"),
-    *("learner.log_std=-1.2", "num_envs=32", "episodes=80", "evaluation.interval=4"),
+    *("learner.log_std=-1.2", "num_envs=32", "episodes=60", "evaluation.interval=4"),
 ]
 ATTENTION = "policy.message=attention"
 EXCHANGES: dict[str, tuple[str, Sequence[str]]] = {
@@ -45,12 +45,9 @@ ARMS: dict[str, dict[str, Sequence[str]]] = {
         "map": ("none", "maps", "attention", "maps_16", "attention_16", "maps_unlimited"),
         "vector": ("none", "attention", "consensus"),
     },
-    "relay": {
-        "map": ("none", "maps", "attention", "maps_unlimited"),
-        "vector": ("none", "attention"),
-    },
-    "paper": {"vector": ("none", "attention"), "map": ("none", "maps")},
-    "swarm": {"map": ("none", "maps")},
+    "relay": {"map": ("none", "maps", "attention", "maps_unlimited")},
+    "paper": {"vector": ("none", "attention")},
+    "swarm": {"map": ("maps",)},
 }
 """world -> observation -> exchanges"""
 MOST = "none", "maps", "attention", "consensus"

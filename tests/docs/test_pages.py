@@ -4,6 +4,7 @@ import re
 import tomllib
 from dataclasses import fields
 from pathlib import Path
+from pydoc import locate
 
 import pytest
 import tables
@@ -89,6 +90,15 @@ def test_the_keys_of_everything_that_can_be_chosen_are_listed(kind, name):
     listed = f"```{{configuration-keys}} {kind} {name}\n" in text
     assert listed == bool(fields(PLUGINS[kind].find(name).config_type))
     assert listed or f"`{name}`" in text
+
+
+def test_the_api_page_names_what_there_is():
+    page = TEXTS[ROOT / "docs/reference/api.md"]
+    module, missing = "", []
+    for kind, name in re.findall(r"\.\. (currentmodule|auto\w+):: (\S+)", page):
+        module = name if kind == "currentmodule" else module
+        missing += [name] if not (locate(name) or locate(f"{module}.{name}")) else []
+    assert missing == []
 
 
 def test_no_line_is_a_comment():
