@@ -16,6 +16,7 @@ COPY_FILE = "fires.npz"
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]
 _Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+_FORMAT = r"^((day|month|year)_first|(milli)?seconds|.*%.*)$"
 _Text = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
@@ -55,7 +56,7 @@ class FileFireConfig:
     """Layer of a GeoPackage or KML, or variable of a NetCDF, that has several."""
     time_field: _Text | tuple[_Text, ...] | None = None
     """Column of the perimeters' times, or the columns of the date and the time of day."""
-    time_format: _Text | None = None
+    time_format: Annotated[str, Field(pattern=_FORMAT, max_length=100)] | None = None
     """`day_first`, `month_first`, `seconds` since 1970, or a pattern such as `%d.%m.%y %H:%M`."""
     incident: _Text | int | None = None
     """Incident whose perimeters are read, where a file has several; "*" reads all as one fire."""

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import binary_propagation, distance_transform_edt, find_objects, label
+from scipy.ndimage import binary_propagation, distance_transform_edt, label, minimum_filter
 
 from emberlink.envs.config import BASE_SIDE
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.plane import Bounds
-from emberlink.envs.fire_files.report import SECONDS, Clock, Report, ask
+from emberlink.envs.fire_files.report import SECONDS, Clock, Report, ask, counted
 from emberlink.envs.fire_files.times import in_utc, parse_dates
 from emberlink.envs.utils.errors import UserError
 
@@ -66,8 +66,6 @@ class Fire:
     first: float
     """time of the first arrival"""
     last: float
-    began: float
-    """time of ignition"""
     whole: bool
     """True for a map of the whole grid, which is neither cropped nor burnt out"""
 
@@ -98,7 +96,13 @@ def on_grid(
     if config.start is None and not in_steps and not (times <= start).any():
         times[times == times.min()] = start  # the first cell burns from step 0
     if not fire.whole:
-        report.doubts += _far_apart(np.isfinite(times)) if np.isfinite(times).any() else []
+        places = _beginnings(((times - start) / (end - start)).round(2))
+        report.facts.append(f"{counted(places, 'place')} where it begins")
+        near: Any = distance_transform_edt(np.isinf(times))
+        parts = label(near <= min(grid) / 10, EIGHT)[1]  # pyright: ignore
+        if parts > 1:
+            found = f"{parts} groups of parts never join and lie a fifth of the grid apart"
+            report.doubts.append(f"{found}: one fire? (fire.incident)")
         if config.ring_width is not None:
             times[_burnt_out(times, start, config.ring_width * min(grid) / BASE_SIDE)] = np.inf
     steps = (np.maximum(times, start) - start) / (end - start) * horizon
@@ -112,14 +116,25 @@ def _span(fire: Fire, config: FileFireConfig, horizon: int) -> tuple[float, floa
     """Returns the times of the first and last step."""
     clock, steps = fire.clock, config.minutes_per_step
     start, end = (_time(getattr(config, key), fire, config) for key in ("start", "end"))
-    start, end = fire.began if start is None else start, fire.last if end is None else end
+    start = beginning(fire.clock, config, fire.first, fire.last) if start is None else start
+    end = fire.last if end is None else end
     if steps is not None and clock.unit not in SECONDS:
         raise ask(f"fire.minutes_per_step: times are in {clock.unit}", "fire.units")
     if steps is not None:
         end = start + horizon * steps * 60 / SECONDS[clock.unit]
-    if end < fire.began or start >= min(fire.last, end):
+    if end < min(start, fire.first) or start >= min(fire.last, end):
         raise _no_fire(fire, start, end)
     return start, end
+
+
+def beginning(clock: Clock, config: FileFireConfig, first: float, last: float) -> float:
+    """Returns when a fire began: elapsed times are counted from there."""
+    if clock.origin is not None or clock.unit == "day_of_year" or clock.unit not in SECONDS:
+        return first
+    if config.start is None and first > last - first > 0:
+        seen = f"times from {clock.format(first)} to {clock.format(last)}"
+        raise ask(seen, "fire.start=0 if it began at 0", f"fire.start={first:g} if it began then")
+    return 0.0
 
 
 def _time(value: float | str | None, fire: Fire, config: FileFireConfig) -> float | None:
@@ -141,18 +156,13 @@ def _no_fire(fire: Fire, *span: float) -> UserError:
     return UserError(f"from {start} to {end} no fire spreads; it burns from {first} to {last}")
 
 
-def _far_apart(burns: np.ndarray) -> list[str]:
-    """Returns a doubt if parts of a fire never join and lie farther apart than they are long."""
-    near: Any = distance_transform_edt(~burns)
-    reach, longest, parts = -1.0, 0.0, 0
-    while longest > reach:
-        reach = longest
-        groups, parts = label(near <= 0.75 * reach, EIGHT)  # pyright: ignore
-        if parts < 2:
-            return []
-        boxes = find_objects(np.where(burns, groups, 0))
-        longest = max(float(axis.stop - axis.start) for box in boxes for axis in box)
-    return [f"{parts} groups of parts never join, and lie far apart: one fire? (fire.incident)"]
+def _beginnings(times: np.ndarray) -> int:
+    """Returns the number of places that burn before all cells around them."""
+    burns, earliest = np.isfinite(times), times == minimum_filter(times, 3)
+    # Of cells that burn at the same time, one may have an earlier neighbour: no beginning.
+    later = minimum_filter(np.where(burns & ~earliest, times, np.inf), 3) == times
+    places: Any = label(burns & earliest, EIGHT)
+    return int(places[1] - len(np.unique(places[0][burns & earliest & later])))
 
 
 def _burnt_out(times: np.ndarray, start: float, width: float) -> np.ndarray:

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_erosion, label
+from scipy.ndimage import binary_erosion
 from scipy.spatial import KDTree
 
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.files import library
-from emberlink.envs.fire_files.grid import EIGHT, Fire, Window
+from emberlink.envs.fire_files.grid import EIGHT, Fire, Window, beginning
 from emberlink.envs.fire_files.plane import Bounds, choose_plane
 from emberlink.envs.fire_files.report import Report, ask, counted
 from emberlink.envs.fire_files.tables import choose_features
@@ -39,7 +39,7 @@ class Perimeters(Fire):
 
     def on(self, window: Window, until: float, report: Report) -> np.ndarray:
         """Divides the time between two fronts by a sample's distances to both."""
-        points, begun, idle = window.samples(), 0, 0
+        points, idle = window.samples(), 0
         burnt, times = np.zeros(points.grid, bool), np.full(points.grid, np.inf)
         front = KDTree(np.empty((0, 2)))
         centres = np.stack(np.meshgrid(*points.axes(), indexing="ij"), -1)
@@ -49,9 +49,6 @@ class Perimeters(Fire):
             new, last = after & ~burnt, front
             edge = _front(np.concatenate([last.data, _outline(parts, points.side)]), after, points)
             front = KDTree(edge, balanced_tree=False, compact_nodes=False)
-            labels: Any = label(new, EIGHT)
-            beside: Any = binary_dilation(burnt, EIGHT)
-            begun += labels[1] - len(np.unique(labels[0][new & beside]))
             idle += k > 0 and not new.any()
             if k > 0:
                 share = _share(last, front, centres[new])
@@ -61,7 +58,6 @@ class Perimeters(Fire):
             burnt = after
             if self.at[k] >= until:
                 break
-        report.facts.append(f"{counted(begun, 'place')} where it begins")
         report.facts += [f"{idle} within the area burnt before"] if idle else []
         return window.earliest(times)
 
@@ -139,13 +135,9 @@ def read_perimeters(
     ]
     areas = [_areas(shapes[values == time]) for time in at]
     ends = float(at[0]), float(at[-1])
-    # A fire with elapsed times began at 0.
-    if clock.origin is None and config.units != "day_of_year" and (config.start or 0) != at[0] > 0:
-        if config.start is None and at[0] > at[-1] - at[0]:
-            then = f"fire.start={at[0]:g} if it began then"
-            raise ask(f"times from {first} to {last}", "fire.start=0 if it began at 0", then)
+    if config.start != at[0] > beginning(clock, config, *ends):
         areas, at = [_at_zero(areas, at), *areas], np.concatenate([[0.0], at])
-    return Perimeters(clock, *ends, float(at[0]), whole=False, areas=areas, at=at)
+    return Perimeters(clock, *ends, whole=False, areas=areas, at=at)
 
 
 def _at_zero(areas: Sequence[np.ndarray], at: np.ndarray) -> np.ndarray:

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import binary_erosion, label, map_coordinates, minimum_filter, minimum_filter1d
+from scipy.ndimage import binary_erosion, map_coordinates, minimum_filter, minimum_filter1d
 
 from emberlink.envs.config import SIDES
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.files import first_line, library, members
-from emberlink.envs.fire_files.grid import EIGHT, Fire, Window
+from emberlink.envs.fire_files.grid import Fire, Window
 from emberlink.envs.fire_files.plane import Bounds, Plane, choose_plane
 from emberlink.envs.fire_files.report import Clock, Report, ask, counted
 from emberlink.envs.fire_files.times import decided_unit, in_order, in_utc, parse_dates
@@ -33,7 +33,6 @@ _UNITS = {
     "steps": r"steps?|time ?steps?",
     "no unit of time": r"m|ft|feet|foot|met(er|re)s?|deg(ree)?s?|%|percent|.+/.+",
 }
-_NORTH_UP = (1.0, 0.0, 0.0, 0.0, -1.0)
 _SIDE = 30  # cells along a side of the paper's map
 _SKIPPED = 6000  # lines of the paper's text before step 0
 _MAX_TIME = 1e12
@@ -46,8 +45,8 @@ class Raster(Fire):
     """A fire of arrival times in cells, [rows, columns], inf for never."""
 
     times: np.ndarray
-    affine: tuple[float, ...]
-    """(a, b, c, d, e, f): x = a column + b row + c, y = d column + e row + f"""
+    matrix: np.ndarray
+    """affine, [3, 3]: x and y of a fractional column and row"""
     plane: Plane
 
     def bounds(self, until: float | None) -> Bounds:
@@ -60,11 +59,10 @@ class Raster(Fire):
             if burnt.sum() < 2:
                 raise UserError(f"until {self.clock.format(until)} no fire spreads: a single cell")
             inner: Any = binary_erosion(burnt)
-            rows, columns = np.nonzero(burnt & ~inner)
-            at, left = np.array([rows, columns]), until - self.times[rows, columns]
+            at = np.stack(np.nonzero(burnt & ~inner))
             # Along each axis, the front has passed the centre by less than a cell.
-            before = [minimum_filter1d(self.times, 3, axis)[rows, columns] for axis in (0, 1)]
-            passed = self.times[rows, columns] - before
+            before = [minimum_filter1d(self.times, 3, axis)[*at] for axis in (0, 1)]
+            left, passed = until - self.times[*at], self.times[*at] - before
             reach = np.where(left < passed, left / np.where(passed > 0, passed, 1), 0.5)
             x, y = self._places(*np.concatenate([at + 0.5 - reach, at + 0.5 + reach], 1))
         return float(x.min()), float(y.min()), float(x.max()), float(y.max())
@@ -74,47 +72,40 @@ class Raster(Fire):
 
         A map of the whole grid, and a raster with the grid's cells, are not interpolated.
         """
-        rows, columns = self._cells(window)
-        size = math.hypot(rows[1, 1] - rows[0, 0], columns[1, 1] - columns[0, 0]) / math.sqrt(2)
-        apart = max(np.abs(at - np.rint(at)).max() for at in (rows, columns))
-        points = window if apart < 1e-3 and abs(size - 1) < 1e-6 else window.samples()
-        rows, columns = self._cells(points)
-        ends = zip((rows, columns), self.times.shape, strict=True)
-        near = [np.clip(np.rint(at).astype(np.int64) + 1, 0, end + 1) for at, end in ends]
-        times = np.pad(self.times, 1, constant_values=np.inf)[*near]
+        at = self._cells(window)
+        if np.abs(at - np.rint(at)).max() > 1e-3:
+            at = self._cells(window.samples())
+        burns = np.isfinite(self.times)
+        times = map_coordinates(self.times, at, order=0, mode="grid-constant", cval=np.inf)
         if not self.whole:
-            burns = np.isfinite(self.times)
             weights, total = (
-                map_coordinates(values, (rows, columns), order=1, mode="nearest")
+                map_coordinates(values, at, order=1, mode="nearest")
                 for values in (burns.astype(np.float64), np.where(burns, self.times, 0.0))
             )
             between = np.maximum(total / np.where(weights > 0, weights, 1), self.first)
             times = np.where(np.isinf(times) | (weights == 0), np.inf, between)
         earliest = window.earliest(times)
-        # Points that are farther apart than the cells miss some of these.
-        missed = size * points.side / window.side > 1 + 1e-6
-        first = np.isfinite(self.times) & (missed | (self.times == minimum_filter(self.times, 3)))
-        rows, columns = np.nonzero(first)
+        # Samples that are farther apart than the cells miss some of these.
+        missed = np.abs(at[:, 1, 1] - at[:, 0, 0]).max() > 1 + 1e-6
+        rows, columns = np.nonzero(burns & (missed | (self.times == minimum_filter(self.times, 3))))
         i, j, there = window.cells(*self._places(rows + 0.5, columns + 0.5))
         np.minimum.at(earliest, (i[there], j[there]), self.times[rows[there], columns[there]])
         return earliest
 
-    def _places(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _places(self, rows: Any, columns: Any) -> tuple[np.ndarray, np.ndarray]:
         """Returns x and y on the plane of fractional rows and columns."""
-        a, b, c, d, e, f = self.affine
-        return self.plane.project(a * columns + b * rows + c, d * columns + e * rows + f)
+        return self.plane.project(*_moved(self.matrix, columns, rows))
 
-    def _cells(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the rows and columns, 0 at the first centre, of a window's centres, [X, Y]."""
-        (a, b, c, d, e, f), area = self.affine, _area(self.affine)
+    def _cells(self, window: Window) -> np.ndarray:
+        """Returns the rows and columns, 0 at the first centre, of a window's centres, [2, X, Y]."""
         x, y = self.plane.project(*np.meshgrid(*window.axes(), indexing="ij"), back=True)
-        found = (a * (y - f) - d * (x - c)) / area - 0.5, (e * (x - c) - b * (y - f)) / area - 0.5
-        rows, columns = (np.nan_to_num(at, nan=-9, posinf=-9, neginf=-9) for at in found)
-        return rows, columns
+        columns, rows = _moved(np.linalg.inv(self.matrix), x, y)
+        return np.nan_to_num(np.stack([rows, columns]) - 0.5, nan=-9, posinf=-9, neginf=-9)
 
 
-def _area(affine: tuple[float, ...]) -> float:
-    return affine[0] * affine[4] - affine[1] * affine[3]
+def _moved(matrix: np.ndarray, x: Any, y: Any) -> tuple[Any, Any]:
+    (a, b, c), (d, e, f), _ = matrix
+    return a * x + b * y + c, d * x + e * y + f
 
 
 def read_raster(
@@ -124,34 +115,27 @@ def read_raster(
     if kind == "points":
         return [_front_points(path, config, report)]
     if kind in ("npy", "grids"):
-        maps, affine, crs = _array(path, kind), None, None
+        maps, affine, crs = _array(path, kind), np.eye(3), None
         if config.kind != "masks":
             return _bank(path, maps, config, horizon, report)
         times, clock, what = _of_states(maps, config)
     else:
         with _opened(path, kind, config.layer) as dataset:
-            affine, crs = tuple(dataset.transform[:6]), dataset.crs
-            affine = None if dataset.transform.is_identity else affine
+            affine, crs = np.reshape(dataset.transform, (3, 3)), dataset.crs
             if config.kind == "masks":
                 times, clock, what = _of_states(_read(dataset, MAX_BANK), config)
             else:
                 times, clock, what = _band(dataset, kind == "nc", config)
-    north_up = (*_NORTH_UP, float(len(times)))
-    plane = Plane("no place in the file: square cells, the first row in the north")
-    fire = as_fire(times, clock, affine or north_up, plane)
-    if crs is not None or affine not in (None, (*_NORTH_UP, fire.affine[5])):
-        if not 1e-20 < abs(_area(fire.affine)) < 1e12:
-            raise ask(f"cells of {fire.affine[0]:g} x {fire.affine[4]:g}", "a size above 0")
+    nowhere = Plane("no place in the file: square cells, the first row in the north")
+    fire = as_fire(times, clock, nowhere)
+    if crs is not None or not (np.allclose(affine, np.eye(3)) or np.allclose(affine, fire.matrix)):
+        if not 1e-20 < abs(np.linalg.det(affine)) < 1e12:
+            raise ask(f"cells of {affine[0, 0]:g} x {affine[1, 1]:g}", "a size above 0")
+        fire.matrix = affine
         fire.plane = choose_plane(crs, config.crs, fire.bounds(None))
-    row, column = np.unravel_index(times.argmin(), times.shape)
-    around = times[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-    crossing = (around[np.isfinite(around)] - fire.first).max()
-    if fire.first <= crossing and clock.origin is None and clock.unit not in ("steps", "maps"):
-        fire.began = 0.0  # the ignition lies between the centres of cells
     begin, end = clock.format(fire.first), clock.format(fire.last)
-    places = f"{counted(_beginnings(times), 'place')} where it begins"
     burn = f"{np.isfinite(times).sum()} cells burn from {begin} to {end}"
-    report.facts += [burn, places, what, fire.plane.about]
+    report.facts += [burn, what, fire.plane.about]
     return [fire]
 
 
@@ -225,24 +209,14 @@ def _of_states(maps: np.ndarray, config: FileFireConfig) -> tuple[np.ndarray, Cl
     return *in_order(times, unit, config), what
 
 
-def as_fire(times: np.ndarray, clock: Clock, affine: Any, plane: Plane | None = None) -> Raster:
-    """Returns a fire that begins with its first arrival; without a plane, a map of the grid."""
+def as_fire(times: np.ndarray, clock: Clock, plane: Plane | None = None) -> Raster:
+    """Returns a fire of square cells, the first row in the north; without plane, a whole map."""
     burning = times[np.isfinite(times)]
     if len(burning) < 2:
         raise ask(f"{counted(len(burning), 'cell')} burn", "arrival times of a fire that spreads")
-    first, last, whole = float(burning.min()), float(burning.max()), plane is None
-    return Raster(
-        clock, first, last, first, whole, times.astype(np.float64), affine, plane or Plane("")
-    )
-
-
-def _beginnings(times: np.ndarray) -> int:
-    """Returns the number of places that burn before all cells around them."""
-    burns, earliest = np.isfinite(times), times == minimum_filter(times, 3)
-    # Of cells that burn at the same time, one may have an earlier neighbour: no beginning.
-    later = minimum_filter(np.where(burns & ~earliest, times, np.inf), 3) == times
-    places: Any = label(burns & earliest, EIGHT)
-    return int(places[1] - len(np.unique(places[0][burns & earliest & later])))
+    north_up = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, len(times)], [0.0, 0.0, 1.0]])
+    ends, whole = (float(burning.min()), float(burning.max())), plane is None
+    return Raster(clock, *ends, whole, times.astype(np.float64), north_up, plane or Plane(""))
 
 
 def _array(path: Path, kind: str) -> np.ndarray:
@@ -287,8 +261,7 @@ def _bank(
     sources = []
     for place, values in enumerate(fires):
         try:
-            times = _arrival(values.T[::-1], None, config)
-            sources.append(as_fire(times, Clock("steps"), (*_NORTH_UP, float(rows))))
+            sources.append(as_fire(_arrival(values.T[::-1], None, config), Clock("steps")))
         except UserError as error:
             raise UserError(f"fire {place}: {error}") from None
     report.facts.append(f"a bank of {counted(count, 'fire')} of {columns} x {rows} cells, in steps")
@@ -314,8 +287,7 @@ def _front_points(path: Path, config: FileFireConfig, report: Report) -> Raster:
     if count <= _SKIPPED:
         raise ask(f"{count} lines", f"more than {_SKIPPED}, which are skipped")
     report.facts.append(f"the paper's text of {count} lines, a line per time")
-    clock = Clock(config.units or "steps")
-    return as_fire(times[2:-2, 2:-2].T[::-1], clock, (*_NORTH_UP, float(_SIDE)))
+    return as_fire(times[2:-2, 2:-2].T[::-1], Clock(config.units or "steps"))
 
 
 def _arrival(values: np.ndarray, nodata: np.ndarray | None, config: FileFireConfig) -> np.ndarray:

@@ -22,7 +22,7 @@ from emberlink.envs.fire_files.tables import read_table
 from emberlink.envs.utils.atomic_io import open_regular, replaced, user_path
 from emberlink.envs.utils.errors import UserError, naming, printable
 
-READER_VERSION = 11  # increase it if the same file gives another grid
+READER_VERSION = 12  # increase it if the same file gives another grid
 _OF_TABLES = ("time_field", "time_format", "incident", "incident_field", "where", "radius")
 
 

@@ -6,6 +6,7 @@ from datetime import datetime, timedelta
 from emberlink.envs.utils.errors import UserError
 
 SECONDS = {"seconds": 1.0, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
+SECONDS["day_of_year"] = SECONDS["days"]
 
 
 @dataclass
@@ -27,7 +28,7 @@ class Clock:
     def format(self, time: float) -> str:
         """Returns a time as text."""
         if self.origin is None or abs(time * SECONDS[self.unit]) > 1e10:
-            return f"{time:g} {self.unit}"
+            return f"{time:g} {self.unit}".replace("day_of_year", "days")
         date = self.origin + timedelta(seconds=time * SECONDS[self.unit])
         return date.isoformat(timespec="minutes")
 

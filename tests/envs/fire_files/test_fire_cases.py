@@ -38,7 +38,7 @@ TABLE = {
         {"units": "days"},
         "days 1 to 6 and 358 to 365.*fire.units=day_of_year",
         {"units": "day_of_year"},
-        "from 358 days to 371 days; 1 place",
+        "from 358 days to 371 days.*; 1 place",
     ),
     "07_pm_ignored/perimeters.geojson": ({}, "", {}, "8 times, .*05T01:30.*08T13:30"),
     "08_day_first/perimetros.geojson": (
@@ -77,7 +77,12 @@ TABLE = {
         {"where": "FeatureCategory=Wildfire*"},
         "6 of 7 features used",
     ),
-    "14_yymmddhhmm/perimeters.geojson": ({}, "", {}, "2018-08-19T20:00.*2018-08-20T03:00"),
+    "14_yymmddhhmm/perimeters.geojson": (
+        {},
+        "fits seconds .2027-04-20 03:33. or %y%m%d%H%M .2018-08-19 20:00",
+        {"time_format": "%y%m%d%H%M"},
+        "2018-08-19T20:00.*2018-08-20T03:00",
+    ),
     "15_shapefile_date_only/Perimeters.shp": ({}, "", {}, "3 times"),
     "16_active_areas/active.geojson": ({}, "", {}, "1 within the area burnt before"),
     "17_forefire_geojson/fronts": ({}, "", {}, "5 times, .*T18:00.*T22:00.*from valid_at"),

@@ -54,25 +54,24 @@ def same(path, elapsed, says="", **keys):
 @pytest.mark.parametrize(
     ("columns", "joined"),
     [
-        ({"date": DAY, "hour": [9, 10, 11], "minute": [5] * 3}, "hour and minute"),
-        ({"DATE_": ["9/25/2020"] * 3, "TIME_": [2055, 2155, 2255]}, "DATE_ and TIME_"),
-        ({"date": DAY, "time": ["930", "1030", "1130"], "half": ["AM"] * 3}, "half"),
-        ({"fecha": DAY, "hora": ["9:55 PM", "10:55 PM", "11:55 PM"]}, "fecha and"),
+        ({"DATE_": ["9/25/2020"] * 3, "TIME_": [2055, 2155, 2255]}, ""),
+        ({"date": DAY, "hour": [9, 10, 11], "minute": [5] * 3}, "date,hour,minute"),
+        ({"date": DAY, "time": ["930", "1030", "1130"], "half": ["AM"] * 3}, "date,time,half"),
+        ({"date": DAY, "flight_time": ["0900", "1000", "1100"]}, "date,flight_time"),
     ],
 )
-def test_a_date_beside_a_time_of_day_is_joined(tmp_path, elapsed, columns, joined):
-    keys = {"time_field": "fecha"} if "fecha" in columns else {}
-    squares(200, 300, 400, **columns).to_file(tmp_path / "fire.geojson")
-    same(tmp_path / "fire.geojson", elapsed, joined, **keys)
+def test_a_date_beside_a_time_of_day_is_joined_or_asked_for(tmp_path, elapsed, columns, joined):
+    path, keys = tmp_path / "fire.geojson", {}
+    squares(200, 300, 400, **columns).to_file(path)
+    if joined:
+        asks(path, rf"'fire.time_field=\[{joined}\]'")
+        keys = {"time_field": tuple(joined.split(","))}
+    same(path, elapsed, " and ".join(columns), **keys)
 
 
-def test_a_time_of_day_of_another_column_is_asked_for(tmp_path, elapsed):
-    frame = squares(200, 300, 400, date=DAY, flight_time=["0900", "1000", "1100"])
-    frame.to_file(tmp_path / "fire.gpkg")
-    asks(tmp_path / "fire.gpkg", r"'fire.time_field=\[date,flight_time\]'")
-    same(tmp_path / "fire.gpkg", elapsed, time_field=("date", "flight_time"))
-    frame = frame.drop(columns="flight_time")
-    frame.assign(time=["0900", "2575", "1100"]).to_file(tmp_path / "wrong.gpkg")
+def test_a_wrong_time_of_day_is_named(tmp_path):
+    frame = squares(200, 300, 400, date=DAY, time=["0900", "2575", "1100"])
+    frame.to_file(tmp_path / "wrong.gpkg")
     asks(tmp_path / "wrong.gpkg", "date and time=.2020-09-05 2575. is not a date")
 
 
@@ -150,7 +149,10 @@ def test_fill_values_are_asked_about_together_and_a_large_ignition_is_not(tmp_pa
     path = write_tif(tmp_path / "burn.tif", times.astype("int16"), nodata=None)
     listed = r"-2 \(5 ?% of the cells\) and 0 \(\d+ ?% .*expected 'fire.unburned=\[-2,0\]'"
     asks(path, listed, units="day_of_year")
-    assert "from 200 days to 204 days" in read(path, units="days", unburned=(-2.0, 0.0))[1]
+    assert (
+        "from 200 days to 204 days"
+        in read(path, units="days", unburned=(-2.0, 0.0), start=200.0)[1]
+    )
     times = raster_of(FIRE, 300.0)
     lit = write_tif(tmp_path / "lit.tif", np.where(times < 0, times, np.maximum(times - 150, 0)))
     assert "from 0 minutes to 149" in read(lit, units="minutes")[1]
@@ -170,8 +172,7 @@ def test_fill_values_are_asked_about_together_and_a_large_ignition_is_not(tmp_pa
         ("2020-09-05 18:00 PDT", "2020-09-05T18:00:00-07:00"),
         ("2020-245", "2020-09-01T00:00:00"),
         ("20200819130000", "2020-08-19T13:00:00"),
-        ("1808192000", "2018-08-19T20:00:00"),
-        ("2018081920", "2018-08-19T20:00:00"),
+        ("201808192000", "2018-08-19T20:00:00"),
         ("1598274000", "2020-08-24T13:00:00+00:00"),
         ("1599328800000", "2020-09-05T18:00:00+00:00"),
     ],
@@ -185,13 +186,13 @@ def test_forms_of_dates(text, expected):
     [
         (["05-08-2020"], None, "fits day_first .2020-08-05 .* or month_first"),
         (["05.08.20"], None, "day_first .* or month_first .* or year_first"),
-        (["1008192000"], None, "fits seconds .2001-12-12 .* or %y%m%d%H%M .2010-08-19"),
+        (["1808192000"], None, "fits seconds .2027-04-20 .* or %y%m%d%H%M .2018-08-19"),
+        (["2018081920"], None, "fits seconds .2033-12-.* or %Y%m%d%H .2018-08-19"),
         (["2020-09-05 18:00 CEST"], None, "is not a date"),
         (["2020-09-05 13:30 PM"], None, "is not a date"),
         (["2020-13-05"], None, "is not a date"),
         (["13/08/2020", "08/14/2020"], None, "is not a date"),
         (["5 de agosto"], None, "is not a date; expected .*fire.time_format"),
-        (["2020-09-05"], "noon", "fire.time_format=noon; expected"),
     ],
 )
 def test_dates_that_are_asked_about(texts, form, match):
@@ -270,7 +271,7 @@ def test_a_folder_of_cell2fire(tmp_path):
         np.savetxt(tmp_path / f"ForestGrid{step}.csv", grid, "%d", ",")
     asks(tmp_path, "11 maps of the states 0 .*fire.kind=masks")
     fire, about = read(tmp_path, kind="masks", margin=None)
-    assert "from 0 maps to 10 maps; 1 place where it begins; 11 maps of the states 0, 1" in about
+    assert "from 0 maps to 10 maps; 11 maps of the states 0, 1" in about
     assert (fire == 0).any(0).nonzero().flatten().tolist() == [8, 9]  # the sixth row from above
 
 

@@ -164,18 +164,18 @@ def test_a_raster_turned_by_its_transform(tmp_path):
         assert (a & b).sum() / (a | b).sum() > least
 
 
-@pytest.mark.parametrize("first", [0.0, 3.0, 10.0, 10.5, 700.0])
-def test_a_fire_begins_at_0_where_its_first_cell_allows_it(tmp_path, first):
-    """Burns a cell every ten minutes, so that an ignition at the edge of the first cell was at
-    most ten minutes earlier."""
+@pytest.mark.parametrize("first", [0.0, 10.5, 700.0])
+def test_a_fire_of_elapsed_times_begins_at_0_or_is_asked_about(tmp_path, first):
+    """Burns a cell every ten minutes."""
     path = write_asc(tmp_path / "fire.asc", corner([[first + t for t in (0, 10, 20, 30)]], 1, 4))
-    began = 0.0 if first <= 10 else first
-    fire = read(path, horizon=100)[:4, 7]
-    last = first + 30 - began
-    later = [100 * (first + t - began) / last for t in (10, 20, 30)]
-    assert fire.tolist() == pytest.approx([0.0, *later], abs=1e-3)
+    if first > 30:
+        with pytest.raises(ValueError, match=r"expected fire.start=0 .* or fire.start=700"):
+            read(path)
+    later = [100 * (first + t) / (first + 30) for t in (10, 20, 30)]
     given = read(path, horizon=100, start=0.0)[:4, 7]
-    assert given[0].item() == pytest.approx(100 * first / (first + 30), abs=1e-3)
+    assert given.tolist() == pytest.approx([100 * first / (first + 30), *later], abs=1e-3)
+    if first < 30:
+        assert read(path, horizon=100)[:4, 7].tolist() == pytest.approx([0.0, *later], abs=1e-3)
     steps = read(path, horizon=800, units="steps")[:4, 7]
     assert steps.tolist() == pytest.approx([first + t for t in (0, 10, 20, 30)])
 
@@ -218,7 +218,7 @@ def test_no_arrival_is_lost(rows, columns, side, x, y, seed):
     times[0, 0] = 5.0
     window, last = Window(x, y, side, (8, 9)), times[times < INF].max()
     for plane in (Plane(""), None):  # None: a map of the whole grid
-        fire = as_fire(times, Clock("minutes"), (1, 0, 0, 0, -1, rows), plane)
+        fire = as_fire(times, Clock("minutes"), plane)
         got = fire.on(window, INF, Report())
         assert (got >= times.min() - 1e-9).all()
         assert (np.isinf(got) | (got <= last + 1e-9)).all()
