@@ -27,13 +27,12 @@ FOLDERS = " > "
 """Between the names of folders, one within the other."""
 _SHAPES = ("Point", "LineString", "Polygon", "MultiGeometry")
 _DEGREES = "EPSG:4326"
+_MAYBE = r"name|id|num|number|label|(f|fire|ig|ignition|event)?(year|yr)"
 _IDENTIFIER = re.compile(
     r"(poly|attr)?(incident|incid|fire|event|burn|complex|cluster|merged?)s?"
-    r"(name|nm|id|num|number|no|nr|code)?|fname|.*irwin.*|.*uniquefire.*"
+    rf"(name|nm|id|num|number|no|nr|code)?|fname|.*irwin.*|.*uniquefire.*|{_MAYBE}"
 )
-"""Columns that identify a fire, by the letters and digits of their names."""
-_MAYBE = re.compile(r"name|id|num|number|label|(f|fire|ig|ignition|event)?(year|yr)")
-"""Columns that may also number the features, or name their times."""
+"""Columns that identify a fire, or maybe the features or times, by the letters of their names."""
 _CATEGORY = re.compile(r".*(category|class|kind|type|status)|(poly)?featu\w*|incidentty|type.*")
 
 
@@ -60,46 +59,43 @@ def read_table(path: Path, kind: str, config: FileFireConfig) -> tuple[Any, list
 
 
 def _of_file(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
-    geopandas, outside = library("geopandas"), []
+    readers = {"json": _geojson, "kml": _kml, "kmz": _kml, "csv": _csv}
     gc.disable()  # it takes two thirds of the time to parse a large text
     try:
-        if kind == "json":
-            frame, outside = _geojson(json.loads(path.read_bytes()))
-        elif kind in ("kml", "kmz"):
-            frame, outside = _kml(path, kind, layer), ["Name", "Folder"]
-        elif kind == "csv":
-            table = library("pandas").read_csv(path, dtype=str, skipinitialspace=True)
-            at = {str(name).lower(): table[name] for name in table.columns}
-            points = geopandas.points_from_xy(at["longitude"], at["latitude"])
-            frame = geopandas.GeoDataFrame(table, geometry=points, crs=_DEGREES)
-        elif kind in ("shp", "gpkg"):
-            frame = _by_gdal(path.absolute(), layer)
-        else:
-            raise ask(kind, "perimeters")
+        frame, outside = readers.get(kind, _by_gdal)(path, layer)
+        if not hasattr(frame, "geometry") or len(frame) == 0:
+            raise ask("no feature with a geometry", "perimeters")
     except UserError:
         raise
     except Exception as error:  # GDAL, text and geometries raise many types
         raise ask(first_line(error), "perimeters") from None
     finally:
         gc.enable()
-    if not hasattr(frame, "geometry") or len(frame) == 0:
-        raise ask("no feature with a geometry", "perimeters")
     frame = frame.assign(**{name: _texts(frame[name]) for name in attributes(frame)})
     return frame.reset_index(drop=True).rename(index="feature {}".format), outside
 
 
-def _by_gdal(path: Path, wanted: str | None) -> Any:
+def _csv(path: Path, _: str | None) -> tuple[Any, list[str]]:
+    table = library("pandas").read_csv(path, dtype=str, skipinitialspace=True)
+    at = {str(name).lower(): table[name] for name in table.columns}
+    points = library("geopandas").points_from_xy(at["longitude"], at["latitude"])
+    return library("geopandas").GeoDataFrame(table, geometry=points, crs=_DEGREES), []
+
+
+def _by_gdal(path: Path, wanted: str | None) -> tuple[Any, list[str]]:
     """Reads the layer `wanted`, or the only layer with geometries."""
     pyogrio = library("pyogrio")
+    path = path.absolute()
     names = [str(name) for name, kind in pyogrio.list_layers(path) if kind is not None]
     if wanted not in names and (wanted or len(names) != 1):
         keys = [as_argument("fire.layer", name) for name in names[:30]]
         raise ask(f"{len(names)} layers of perimeters", *keys)
-    return pyogrio.read_dataframe(path, layer=wanted or names[0], datetime_as_string=True)
+    return pyogrio.read_dataframe(path, layer=wanted or names[0], datetime_as_string=True), []
 
 
-def _geojson(whole: Any) -> tuple[Any, list[str]]:
+def _geojson(path: Path, _: str | None) -> tuple[Any, list[str]]:
     """Reads GeoJSON; texts and numbers beside the features become columns, such as `valid_at`."""
+    whole = json.loads(path.read_bytes())
     features = [whole] if whole.get("type") == "Feature" else whole.get("features")
     if whole.get("type") not in ("Feature", "FeatureCollection") or not isinstance(features, list):
         raise ask(f"type {str(whole.get('type'))[:40]!r}", "a FeatureCollection")
@@ -120,16 +116,14 @@ def _geojson(whole: Any) -> tuple[Any, list[str]]:
     return frame.assign(**about), list(about)
 
 
-def _kml(path: Path, kind: str, layer: str | None) -> Any:
-    """Returns the placemarks of KML; GDAL gets their geometries alone."""
-    rows, marks = [], ElementTree.Element("Document")
-    if kind == "kml":
-        contents = [path.read_bytes()]
-    else:
+def _kml(path: Path, layer: str | None) -> tuple[Any, list[str]]:
+    """Returns the placemarks of KML or KMZ; GDAL gets their geometries alone."""
+    rows, marks, contents = [], ElementTree.Element("Document"), [path.read_bytes()]
+    if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             parts = [part for part in archive.infolist() if part.filename.lower().endswith(".kml")]
-            if not parts or sum(part.file_size for part in parts) > MAX_BYTES:
-                raise ask(f"{len(parts)} .kml in it", f"one, of {MAX_BYTES} bytes at most")
+            if sum(part.file_size for part in parts) > MAX_BYTES:
+                raise ask("its .kml is too large", f"{MAX_BYTES} bytes at most")
             contents = [archive.read(part) for part in parts]
     for content in contents:
         if b"\0" in content[:1000] or re.search(rb"<!(DOCTYPE|ENTITY)", content, re.IGNORECASE):
@@ -146,16 +140,16 @@ def _kml(path: Path, kind: str, layer: str | None) -> Any:
         raise ask("no placemark", "KML with perimeters")
     text = b"<kml>" + ElementTree.tostring(marks) + b"</kml>"
     shapes = library("pyogrio").read_dataframe(io.BytesIO(text), columns=[]).geometry
-    return library("geopandas").GeoDataFrame(rows, geometry=shapes, crs=_DEGREES)
+    frame = library("geopandas").GeoDataFrame(rows, geometry=shapes, crs=_DEGREES)
+    return frame, ["Name", "Folder"]
 
 
 def _placemarks(
     element: Any, folders: tuple[str, ...] = (), time: str | None = None
 ) -> Iterator[tuple[dict[str, str | None], Any]]:
     """Yields each placemark and its attributes; a folder's time holds for its contents."""
-    for part in element:
-        if part.tag in ("TimeStamp", "TimeSpan"):
-            time = part.findtext("when") or part.findtext("begin") or time
+    for part in (*element.findall("TimeStamp"), *element.findall("TimeSpan")):
+        time = part.findtext("when") or part.findtext("begin") or time
     if element.tag != "Placemark":
         folders = (*folders, *filter(None, [element.findtext("name")]))
         for part in element:
@@ -212,12 +206,11 @@ def choose_features(frame: Any, config: FileFireConfig, facts: list[str]) -> Any
 def _where(frame: Any, config: FileFireConfig) -> Any:
     """Returns the features that `fire.where` keeps; asks if a category has several values."""
     if config.where is None:
-        for column in filter(lambda name: _CATEGORY.fullmatch(plain(name)), attributes(frame)):
-            sure = re.search("categ|featu", plain(column)) is not None
-            if 1 < frame[column].nunique() < len(frame) + sure:
-                choice = as_argument("fire.where", f"{column}={frame[column].mode().iloc[0]}")
-                seen = f"features of several kinds: {_counts(frame, column)}"
-                raise ask(seen, choice, "fire.where=* for all of them")
+        known = [name for name in attributes(frame) if _CATEGORY.fullmatch(plain(name))]
+        for column in _several(frame, known, "categ|featu"):
+            choice = as_argument("fire.where", f"{column}={frame[column].mode().iloc[0]}")
+            seen = f"features of several kinds: {_counts(frame, column)}"
+            raise ask(seen, choice, "fire.where=* for all of them")
     if config.where in (None, "*"):
         return frame
     name, equals, pattern = config.where.partition("=")
@@ -231,30 +224,34 @@ def _where(frame: Any, config: FileFireConfig) -> Any:
 
 def _of_incident(frame: Any, config: FileFireConfig) -> Any:
     """Returns the features of `fire.incident`; asks if identifiers differ."""
-    wanted, field, columns = config.incident, config.incident_field, attributes(frame)
-    sure = [name for name in columns if _IDENTIFIER.fullmatch(plain(name))]
-    known = [*sure, *(name for name in columns if _MAYBE.fullmatch(plain(name)))]
+    wanted, field = config.incident, config.incident_field
+    known = [name for name in attributes(frame) if _IDENTIFIER.fullmatch(plain(name))]
     places = known if field is None else [column_named(field, frame, "fire.incident_field")]
+    if wanted == "*":
+        return frame
     other = "fire.incident=* for all as one fire"
-    if wanted not in (None, "*"):
+    if wanted is not None:
         is_it = {at: frame[at].str.lower() == str(wanted).strip().lower() for at in places}
         if not (found := [at for at in places if is_it[at].any()]):
             values = {text for at in places for text in frame[at] if text}
             raise UserError(f"fire.incident={unknown(str(wanted), sorted(values)[:30])}")
-        frame, places = frame[is_it[found[0]]], known
+        frame = frame[is_it[found[0]]]
+        if field is not None:
+            return frame
         other = f"fire.incident_field={found[0]} beside fire.incident for all of these"
-    elif field is not None:
-        sure = places
-    if wanted == "*" or (wanted is not None and field is not None):
-        return frame
-    counts = {name: frame[name].replace("", None).nunique() for name in places}
-    several = [name for name, n in counts.items() if 1 < n < len(frame) + (name in sure)]
-    if several:
+    if several := _several(frame, places, f"^(?!({_MAYBE})$)"):
         answer = as_argument("fire.incident", next(filter(None, frame[several[0]])))
         listed = "; ".join(_counts(frame, name) for name in several)
         seen = f"{len(frame)} features of several fires: {listed}"
         raise ask(seen, f"fire.incident_field={several[0]} {answer}", other)
     return frame
+
+
+def _several(frame: Any, columns: list[Any], sure: str) -> list[Any]:
+    """Returns the columns with several values; of unsure ones, not one for each feature."""
+    counts = {name: frame[name].replace("", None).nunique() for name in columns}
+    every = {name: len(frame) + bool(re.search(sure, plain(name))) for name in columns}
+    return [name for name in columns if 1 < counts[name] < every[name]]
 
 
 def _counts(frame: Any, column: Any) -> str:
