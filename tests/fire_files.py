@@ -138,6 +138,11 @@ def _in_parts(line: shapely.Geometry) -> shapely.Geometry:
     return shapely.MultiLineString(parts)
 
 
+def fires_in(config: Any, grid: tuple[int, int], horizon: int) -> Any:
+    """Returns the fires of a file, [fires, X, Y]."""
+    return read_with_summary(config, grid, horizon)[0]
+
+
 def keys_in(message: str) -> list[str]:
     """Returns the first keys that a message prints after `expected`, as a shell passes them on."""
     tail = message.partition("; expected ")[2]

@@ -4,11 +4,11 @@ import dataclasses
 import math
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import Name
+from emberlink.envs.utils.validation import STRICT, Name
 
 Units = Literal["steps", "seconds", "minutes", "hours", "days", "day_of_year"]
 COPY_FILE = "fires.npz"
@@ -20,11 +20,7 @@ _FORMAT = r"^((day|month|year)_first|(milli)?seconds|.*%.*)$"
 _Text = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
-@dataclass(
-    frozen=True,
-    kw_only=True,
-    config=ConfigDict(extra="forbid", strict=True, use_attribute_docstrings=True),
-)
+@dataclass(frozen=True, kw_only=True, config={**STRICT, "use_attribute_docstrings": True})
 class FileFireConfig:
     """Fires read from a file: a raster, perimeters, points of the front, or a bank."""
 

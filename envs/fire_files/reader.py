@@ -4,7 +4,7 @@ import dataclasses
 import json
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,33 +26,30 @@ READER_VERSION = 12  # increase it if the same file gives another grid
 _OF_TABLES = ("time_field", "time_format", "incident", "incident_field", "where", "radius")
 
 
-def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> Tensor:
-    """Returns the fires of `config.path`, float32 [fires, X, Y], steps; inf never burns."""
-    return read_with_summary(config, grid, horizon)[0]
-
-
 def read_with_summary(
     config: FileFireConfig, grid: tuple[int, int], horizon: int
 ) -> tuple[Tensor, str]:
-    """Returns the fires of `read_fires` and the findings about the file; warns of a misreading."""
+    """Returns the fires of `config.path` and the findings about the file; warns of a misreading.
+
+    The fires are float32 [fires, X, Y], in steps; inf never burns.
+    """
     report = Report()
     with _named(config.path, config.layer) as path, quiet():
         kind = find_format(path)
-        given = [key for key in _OF_TABLES if getattr(config, key) is not None]
         if kind in TABLES and (config.kind == "masks" or config.unburned is not None):
             raise ask("fire.kind=masks and fire.unburned are for rasters", "none")
-        if kind not in TABLES and given:
-            raise ask(f"fire.{given[0]} chooses among perimeters", "none for a raster")
         if kind in TABLES:
             sources = [read_perimeters(read_table(path, kind, config), config, report)]
+        elif given := [key for key in _OF_TABLES if getattr(config, key) is not None]:
+            raise ask(f"fire.{given[0]} chooses among perimeters", "none for a raster")
         else:
             sources = read_raster(path, kind, config, horizon, report)
         try:
             fires = [on_grid(source, config, grid, horizon, report) for source in sources]
         except UserError as error:
             raise UserError("; ".join([str(error), *report.doubts])) from None
-    cells = sorted({int(np.isfinite(fire).sum()) for fire in fires})
-    burn = " to ".join(map(str, cells[:: max(1, len(cells) - 1)]))
+    cells = [int(np.isfinite(fire).sum()) for fire in fires]
+    burn = " to ".join(map(str, sorted({min(cells), max(cells)})))
     facts = [*report.facts, f"{burn} of {' x '.join(map(str, grid))} cells burn"]
     summary, doubts = printable("; ".join(facts)), printable("; ".join(report.doubts))
     if doubts:
@@ -138,15 +135,12 @@ def _key(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
 
 def _read_copy(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> FireSets | None:
     """Returns the run's copy; None if there is none, it is damaged, or it has another grid."""
-    if config.saved_copy is None or config.sha256 is None:
-        return None
     most = 12 * MAX_BANK + 1_000_000  # bytes: float32 of the cells of all sets
-    try:
-        with open_regular(Path(config.saved_copy), most) as file, np.load(file) as arrays:
-            size = sum(part.file_size for part in arrays.zip.filelist)
-            if size > most or str(arrays["key"]) != _key(config, grid, horizon):
-                return None
+    # Damage raises many types.
+    with suppress(Exception), open_regular(Path(config.saved_copy or ""), most) as file:
+        arrays = np.load(file)
+        size = sum(part.file_size for part in arrays.zip.filelist)
+        if config.sha256 and size <= most and str(arrays["key"]) == _key(config, grid, horizon):
             *fires, about = (arrays[name] for name in FireSets._fields)
             return FireSets(*map(torch.from_numpy, fires), printable(str(about)))  # pyright: ignore
-    except Exception:  # damage raises many types
-        return None
+    return None

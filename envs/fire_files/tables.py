@@ -60,6 +60,7 @@ def read_table(path: Path, kind: str, config: FileFireConfig) -> tuple[Any, list
 
 def _of_file(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
     readers = {"json": _geojson, "kml": _kml, "kmz": _kml, "csv": _csv}
+    library("geopandas")
     gc.disable()  # it takes two thirds of the time to parse a large text
     try:
         frame, outside = readers.get(kind, _by_gdal)(path, layer)

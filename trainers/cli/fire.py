@@ -25,8 +25,7 @@ def add_fire(commands: Any) -> None:
         "the growth of the fire, and whether the setup's UAVs can keep up with it.",
         "emberlink fire preview ArrivalTime.asc fire.units=minutes 'env.grid=[40,40]' setup=tuned",
     )
-    source = "a scenario (huygens, or huygens:3 for its test fire 3), a file (or bank.npy:3), or "
-    source += "fire=file fire.path=FILE; "
+    source = "a scenario (or huygens:3, its test fire 3), a file (or bank.npy:3), or fire=NAME; "
     preview("arguments", metavar="SOURCE | key=value", nargs="+", help=source + _KEYS)
     preview("--output", metavar="PATH", type=path, help="a folder, or a new .png file")
     imported = command(
@@ -38,6 +37,5 @@ def add_fire(commands: Any) -> None:
         "the configuration, in steps, to a new file for fire=file fire.path=BANK.",
         "emberlink fire import ArrivalTime.asc fire.units=minutes --output fires.npy",
     )
-    files = "files with one fire or more; " + _KEYS
-    imported("arguments", metavar="FILE | key=value", nargs="+", help=files)
+    imported("arguments", metavar="FILE | key=value", nargs="+", help="files of fires; " + _KEYS)
     imported("--output", metavar="BANK", type=path, required=True, help="a new file, .npy")

@@ -17,6 +17,7 @@ from rich.console import Console
 from emberlink.envs.fire.generator import scenarios
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import read_with_summary
+from emberlink.envs.fire_files.report import counted
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.atomic_io import created, free_name, new_file, user_path
 from emberlink.envs.utils.errors import UserError, shown, unknown
@@ -40,23 +41,21 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
         text, _, index = text.rpartition(":")
     config = _config(overrides, text)
     fire, world = config.fire, config.env
+    fires, name, count, about = [], fire.name, MAX_FIRES, []
     if isinstance(fire, FileFireConfig):
         fires, read = read_with_summary(fire, world.grid, world.horizon)
         name, count, about = Path(fire.path).name, len(fires), [f"read: {read}"]
-        title = f"{name}, fire {index} of {count}" if count > 1 else name
-    else:
-        fires, name, count, about = None, fire.name, MAX_FIRES, []
-        title = f"{name}, test fire {index}"
     if not is_index(index, count):
         raise UserError(f"{shown(name)}: no fire {shown(index)!r}; known: 0 to {count - 1}")
-    if fires is None:
-        arrival = split_times(fires_of(fire).test_fire(int(index), world.grid, world.horizon))[0][0]
-    else:
+    if about:
         arrival = fires[int(index)]
+        title = f"{name}, fire {index} of {count}" if count > 1 else name
+    else:
+        arrival = split_times(fires_of(fire).test_fire(int(index), world.grid, world.horizon))[0][0]
+        title = f"{name}, test fire {index}"
     if path is None:
-        stem = f"fire_{Path(name).stem if fires is not None else name}"
-        stem = re.sub(r"[^\w.+-]", "-", stem + (f"_{index}" if count > 1 else ""))[:100]
-        free = free_name(output or Path(), stem, [".png"])
+        stem = f"fire_{Path(name).stem if about else name}" + f"_{index}" * (count > 1)
+        free = free_name(output or Path(), re.sub(r"[^\w.+-]", "-", stem)[:100], [".png"])
         path = free.with_name(f"{free.name}.png")
     width = 2 * view_radius(world.altitude[1], world.view_angle)
     with created(path) as partial, warnings.catch_warnings():
@@ -74,32 +73,30 @@ def import_files(arguments: Sequence[str], console: Console, output: Path) -> in
     A bank is an .npy of steps, float32 [fires, X, Y], inf for never, with a .json of its facts.
     """
     paths, overrides = _divided(arguments)
-    if not paths:
-        raise UserError("FILE is missing; expected a file, such as ArrivalTime.asc")
-    card = new_file(output, [".npy"]).with_suffix(".json")
-    new_file(card, [".json"])
-    fires, sources, memory = [], [], io.BytesIO()
-    facts: dict[str, Any] = {"axes": ["fire", "x", "y"], "sources": sources}
+    card = new_file(new_file(output, [".npy"]).with_suffix(".json"), [".json"])
+    fires, sources, horizon = [], [], 0
     for path in paths:
         config = _config(overrides, path)
-        fire, world = config.fire, config.env
+        fire, world, horizon = config.fire, config.env, config.env.horizon
         if not isinstance(fire, FileFireConfig):
             raise UserError(f"{shown(path)} is a scenario; expected a file")
-        read, about = read_with_summary(fire, world.grid, world.horizon)
+        read, about = read_with_summary(fire, world.grid, horizon)
         _print(console, f"{Path(path).name}: read: {about}")
         fires.append(read)
         sources.append({"file": Path(path).name, "sha256": fire.sha256, "fires": len(read)})
         if math.isfinite(fire.burn_time):
             warnings.warn("fire.burn_time is not written; give it with the bank", stacklevel=2)
-        facts["horizon"] = world.horizon
-    np.save(memory, torch.cat(fires).numpy())  # in memory first: NumPy does not report a full disk
+    if not fires:
+        raise UserError("FILE is missing; expected a file, such as ArrivalTime.asc")
+    facts = {"axes": ["fire", "x", "y"], "horizon": horizon, "sources": sources}
+    bank, memory = torch.cat(fires), io.BytesIO()
+    np.save(memory, bank.numpy())  # in memory first: NumPy does not report a full disk
     with created(card) as text, created(output) as partial:
         text.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
         partial.write_bytes(memory.getbuffer())
-    count, *grid = torch.cat(fires).shape
-    noun = "fire" if count == 1 else "fires"
-    cells = " x ".join(map(str, grid))
-    _print(console, f"{count} {noun} of {cells} cells, {facts['horizon']} steps", str(output))
+    count, across, up = bank.shape
+    _print(console, f"{counted(count, 'fire')} of {across} x {up} cells, {horizon} steps")
+    _print(console, str(output))
     return 0
 
 

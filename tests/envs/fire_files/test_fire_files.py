@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fire_files import Ellipses, raster_of, write_asc
+from fire_files import Ellipses, fires_in, raster_of, write_asc
 from tiny_run import TINY
 
 from emberlink.envs.fire.generator import load_scenario, make_fires
 from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
-from emberlink.envs.fire_files.reader import fire_sets, read_fires, save_copy, with_checksum
+from emberlink.envs.fire_files.reader import fire_sets, save_copy, with_checksum
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.config_files import known
 from emberlink.trainers.cli import main
@@ -97,7 +97,7 @@ def test_fires_are_divided_into_three_sets(count, train, validation, test, tmp_p
     sets = fire_sets(config, GRID, HORIZON)
     assert len(sets.train) + len(sets.validation) == max(count, 2)
     other = FileFireConfig(path=str(source), units="minutes")
-    assert torch.equal(sets.test, read_fires(other, GRID, HORIZON))
+    assert torch.equal(sets.test, fires_in(other, GRID, HORIZON))
 
 
 def test_a_bank_is_read_unchanged(tmp_path):
@@ -106,14 +106,14 @@ def test_a_bank_is_read_unchanged(tmp_path):
     np.save(tmp_path / "double.npy", fires.double().numpy())
     for name in ("bank.npy", "double.npy"):
         config = FileFireConfig(path=str(tmp_path / name))
-        assert torch.equal(read_fires(config, GRID, 900), fires)
-    early = read_fires(config, GRID, 500)
+        assert torch.equal(fires_in(config, GRID, 900), fires)
+    early = fires_in(config, GRID, 500)
     assert torch.equal(early, torch.where(fires <= 500, fires, torch.inf))
     stretched = FileFireConfig(path=config.path, start=0.0, end=900.0)
-    assert torch.allclose(read_fires(stretched, GRID, 1800), fires * 2)
+    assert torch.allclose(fires_in(stretched, GRID, 1800), fires * 2)
     for keys, cause in (({"units": "minutes"}, "units=minutes"), ({"radius": 3.0}, "radius")):
         with pytest.raises(ValueError, match=rf"double\.npy: fire\.{cause}"):
-            read_fires(FileFireConfig(path=config.path, **keys), GRID, 900)
+            fires_in(FileFireConfig(path=config.path, **keys), GRID, 900)
 
 
 def test_random_fronts_of_the_papers_text(tmp_path):
@@ -128,8 +128,8 @@ def test_random_fronts_of_the_papers_text(tmp_path):
                     expected[u, v] = min(expected[u, v], step)
     path = tmp_path / "fire"
     path.write_text("\n".join("".join(f"{x!r},{y!r},1.0," for x, y in p.tolist()) for p in steps))
-    (fire,) = read_fires(FileFireConfig(path=str(path)), (30, 30), 1000)
+    (fire,) = fires_in(FileFireConfig(path=str(path)), (30, 30), 1000)
     assert torch.equal(fire, expected)
     path.write_text("\n".join([*["1,1,1,"] * 6000, "1,2,", "3,4,5,"]))
     with pytest.raises(ValueError, match=r"line 6001: .*expected x,y,intensity"):
-        read_fires(FileFireConfig(path=str(path)), (30, 30), 1000)
+        fires_in(FileFireConfig(path=str(path)), (30, 30), 1000)

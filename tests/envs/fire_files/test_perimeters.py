@@ -5,10 +5,19 @@ import numpy as np
 import pytest
 import shapely
 import torch
-from fire_files import CORNER, KINDS, UTM, Ellipses, frame_of, raster_of, squares, write_asc
+from fire_files import (
+    CORNER,
+    KINDS,
+    UTM,
+    Ellipses,
+    fires_in,
+    frame_of,
+    raster_of,
+    squares,
+    write_asc,
+)
 
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.reader import read_fires
 
 GRID, HORIZON = (30, 30), 1000
 HOURS = (60.0, 120.0, 180.0, 240.0, 300.0)
@@ -23,7 +32,7 @@ FIRES = {
 def read(path, grid=GRID, horizon=HORIZON, **keys):
     """Returns the fire of a file, [X, Y], without burnt-out cells."""
     config = FileFireConfig(path=str(path), **{"ring_width": None, **keys})
-    (fire,) = read_fires(config, grid, horizon)
+    (fire,) = fires_in(config, grid, horizon)
     return fire
 
 

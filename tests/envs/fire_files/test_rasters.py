@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rasterio
 import torch
-from fire_files import CORNER, Ellipses, write_asc, write_tif
+from fire_files import CORNER, Ellipses, fires_in, write_asc, write_tif
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
@@ -15,7 +15,6 @@ from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.grid import Window
 from emberlink.envs.fire_files.plane import Plane
 from emberlink.envs.fire_files.rasters import as_fire
-from emberlink.envs.fire_files.reader import read_fires
 from emberlink.envs.fire_files.report import Clock, Report
 
 INF = math.inf
@@ -23,7 +22,7 @@ PLAIN = {"units": "minutes", "ring_width": None, "margin": None, "unburned": "no
 
 
 def read(path, grid=(8, 8), horizon=10, **keys):
-    (fire,) = read_fires(FileFireConfig(path=str(path), **{**PLAIN, **keys}), grid, horizon)
+    (fire,) = fires_in(FileFireConfig(path=str(path), **{**PLAIN, **keys}), grid, horizon)
     return fire
 
 

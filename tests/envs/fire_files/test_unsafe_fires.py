@@ -12,10 +12,19 @@ import numpy as np
 import pytest
 import rasterio
 import torch
-from fire_files import UTM, Ellipses, frame_of, points_text, raster_of, write_asc, write_tif
+from fire_files import (
+    UTM,
+    Ellipses,
+    fires_in,
+    frame_of,
+    points_text,
+    raster_of,
+    write_asc,
+    write_tif,
+)
 
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.reader import read_fires, with_checksum
+from emberlink.envs.fire_files.reader import with_checksum
 
 FIRE, TIMES = Ellipses(), (60.0, 120.0, 180.0, 240.0, 300.0)
 NEEDS = {
@@ -26,7 +35,7 @@ NEEDS = {
 
 def read(path, **keys):
     keys = NEEDS.get(path.suffix, {}) | keys
-    return read_fires(FileFireConfig(path=str(path), **keys), (12, 10), 50)
+    return fires_in(FileFireConfig(path=str(path), **keys), (12, 10), 50)
 
 
 def refused(path, match, **keys):
@@ -108,7 +117,7 @@ def test_no_regular_files_and_no_addresses(tmp_path, wholes):
         refused(tmp_path / name, match)
     for text in ("/vsicurl/http://localhost:9/fire.tif", "http://localhost:9/fire.geojson"):
         with pytest.raises(ValueError, match="no such file"):
-            read_fires(FileFireConfig(path=text), (12, 10), 50)
+            fires_in(FileFireConfig(path=text), (12, 10), 50)
 
 
 @pytest.mark.parametrize("ending", [".msk", ".MSK", ".ovr"])
