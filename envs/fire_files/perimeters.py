@@ -45,30 +45,32 @@ class Perimeters(Fire):
         centres = np.stack(np.meshgrid(*points.axes(), indexing="ij"), -1)
         index = library("shapely").STRtree(library("shapely").points(centres.reshape(-1, 2)))
         for k, parts in enumerate(self.areas):
-            after = burnt | _drawn(parts, points, index)
-            new, last = after & ~burnt, front
-            edge = _front(np.concatenate([last.data, _outline(parts, points.side)]), after, points)
+            part, at = _samples_in(parts, points, index)
+            part, at = part[~burnt.flat[at]], at[~burnt.flat[at]]
+            new, last = np.zeros(points.grid, bool), front
+            new.flat[at] = True
+            burnt |= new
+            outline = _outline(parts[np.unique(part)], points.side)
+            edge = _front(np.concatenate([last.data, outline]), burnt, points)
             front = KDTree(edge, balanced_tree=False, compact_nodes=False)
             idle += k > 0 and not new.any()
+            times[new] = self.at[k]
             if k > 0:
                 share = _share(last, front, centres[new])
-                times[new] = self.at[k - 1] + (self.at[k] - self.at[k - 1]) * share
-            else:
-                times[new] = self.at[0]
-            burnt = after
+                times[new] -= (self.at[k] - self.at[k - 1]) * (1 - share)
             if self.at[k] >= until:
                 break
         report.facts += [f"{idle} within the area burnt before"] if idle else []
         return window.earliest(times)
 
 
-def _drawn(parts: np.ndarray, points: Window, index: Any) -> np.ndarray:
-    """Returns the mask of sample points in polygons, at least one per part, bool [X, Y]."""
-    shapely, inside = library("shapely"), np.zeros(points.grid, bool)
-    inside.flat[index.query(parts, predicate="intersects")[1]] = True
+def _samples_in(parts: np.ndarray, points: Window, index: Any) -> np.ndarray:
+    """Returns polygons and the sample points in them, at least one of each, [2, n]."""
+    shapely = library("shapely")
+    inside = index.query(parts, predicate="intersects")
     i, j, there = points.cells(*shapely.get_coordinates(shapely.point_on_surface(parts)).T)
-    inside[i[there], j[there]] = True
-    return inside
+    own = np.flatnonzero(there), i[there] * points.grid[1] + j[there]
+    return np.concatenate([inside, own], 1)
 
 
 def _outline(parts: np.ndarray, side: float) -> np.ndarray:

@@ -43,7 +43,7 @@ _DIGITS = {
     14: ("%Y%m%d%H%M%S",),
 }
 """Patterns of texts of digits, by their length."""
-_ZONES = dict.fromkeys(("Z", "UTC", "GMT", "UT"), "+0000")
+_ZONES = {"Z": "+0000", "UTC": "+0000", "GMT": "+0000", "UT": "+0000"}
 _ZONES |= {"EST": "-0500", "EDT": "-0400", "CST": "-0600", "CDT": "-0500", "MST": "-0700"}
 _ZONES |= {"MDT": "-0600", "PST": "-0800", "PDT": "-0700", "AKST": "-0900", "AKDT": "-0800"}
 """Zones of RFC 2822 and of Alaska."""

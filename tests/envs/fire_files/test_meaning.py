@@ -13,7 +13,7 @@ from scipy.io import netcdf_file
 
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import read_with_summary
-from emberlink.envs.fire_files.times import date_within, parse_dates
+from emberlink.envs.fire_files.times import parse_dates
 
 FIRE = Ellipses()
 DAY = ["2020-09-05"] * 3
@@ -168,10 +168,8 @@ def test_fill_values_are_asked_about_together_and_a_large_ignition_is_not(tmp_pa
         ("Fri, 13 Feb 2026 14:30:58 GMT", "2026-02-13T14:30:58+00:00"),
         ("Saturday, September 5, 2020 12:30:00 AM", "2020-09-05T00:30:00"),
         ("Sat Sep 05 2020 13:30:00 GMT-0700 (Pacific Daylight Time)", "2020-09-05T13:30:00-07:00"),
-        ("05-SEP-20", "2020-09-05T00:00:00"),
         ("2020-09-05 18:00 PDT", "2020-09-05T18:00:00-07:00"),
         ("2020-245", "2020-09-01T00:00:00"),
-        ("20200819130000", "2020-08-19T13:00:00"),
         ("201808192000", "2018-08-19T20:00:00"),
         ("1598274000", "2020-08-24T13:00:00+00:00"),
         ("1599328800000", "2020-09-05T18:00:00+00:00"),
@@ -190,9 +188,7 @@ def test_forms_of_dates(text, expected):
         (["2018081920"], None, "fits seconds .2033-12-.* or %Y%m%d%H .2018-08-19"),
         (["2020-09-05 18:00 CEST"], None, "is not a date"),
         (["2020-09-05 13:30 PM"], None, "is not a date"),
-        (["2020-13-05"], None, "is not a date"),
         (["13/08/2020", "08/14/2020"], None, "is not a date"),
-        (["5 de agosto"], None, "is not a date; expected .*fire.time_format"),
     ],
 )
 def test_dates_that_are_asked_about(texts, form, match):
@@ -200,14 +196,9 @@ def test_dates_that_are_asked_about(texts, form, match):
         parse_dates(texts, form, "t")
 
 
-def test_orders_names_flights_and_the_future(tmp_path, elapsed):
-    read_dates = parse_dates(["05/08/2020 02:00", "13/08/2020 02:00"], None, "t")
-    assert [date.day for date in read_dates] == [5, 13]
+def test_orders_and_the_future(tmp_path, elapsed):
+    assert parse_dates(["05/08/2020", "13/08/2020"], None, "t")[0].day == 5
     assert parse_dates(["05/08/2020"], "month_first", "t")[0].month == 5
-    assert parse_dates(["5h 3. 2020"], "%Hh %d. %Y", "t")[0].hour == 5
-    assert date_within("20200905_1830_Creek_IR") == "20200905 1830"
-    assert date_within("Creek > IR 2020-09-05T18-00") == "2020-09-05T18:00"
-    assert date_within("Flight 3") == date_within("2020-09-05 to 2020-09-06") == ""
     squares(200, 300, 400, date=dates(3, 2090)).to_file(tmp_path / "fire.geojson")
     with pytest.warns(UserWarning, match="2090-09-05 is in the future"):
         same(tmp_path / "fire.geojson", elapsed)

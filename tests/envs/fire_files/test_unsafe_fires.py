@@ -144,9 +144,7 @@ def test_links_declarations_and_sizes_in_texts_are_refused(tmp_path, wholes):
         ("fire.json", json.dumps({**whole, "crs": link}), "crs is a link, which is not followed"),
         ("fire.json", '{"a":' * 100_000, "levels|recursion|expected"),
         ("fire.json", json.dumps({**whole, "crs": None, "type": "Topology"}), "'Topology'"),
-        ("fire.json", json.dumps({**whole, "crs": None, "features": [1]}), "expected"),
         ("fire.kml", f'<!DOCTYPE kml [<!ENTITY a "aaaa">]>{kml}', "document type declaration"),
-        ("fire.kml", "<html></html>", "no placemark"),
     ):
         (tmp_path / name).write_text(text)
         refused(tmp_path / name, match)
@@ -154,7 +152,6 @@ def test_links_declarations_and_sizes_in_texts_are_refused(tmp_path, wholes):
 
 def test_parts_of_a_shapefile(wholes):
     table = wholes[".shp"].with_suffix(".dbf")
-    refused(table, "begins with")
     content = table.read_bytes()
     table.write_bytes(content[: len(content) // 2])
     refused(wholes[".shp"], "front.dbf is damaged")
@@ -173,7 +170,6 @@ def test_values_that_are_no_times(tmp_path):
         (np.where(one == 5, -0.5, times), r"-0.5 \(1 ?% .*fire.unburned=-0.5"),
         (np.where(times < 0, -32768.0, times), "fire.unburned=-32768"),
         (times.astype("complex64"), "real numbers"),
-        (np.stack([times] * 3), "3 bands; expected one"),
     ):
         refused(write_tif(path, values), match)
     refused(write_tif(path, times, crs="EPSG:4326"), "are not the degrees of WGS 84")
