@@ -30,6 +30,7 @@ class ScalarExchange:
         self.acknowledged = [[] for _ in everyone]
         self.flying: list[tuple] = []  # (arrives at, speaker, hearer, looks, acknowledgements)
         self.sent = self.lost = self.arrived = 0
+        self.waits = [0] * radios
 
     def see(self, radio: int, looks: dict) -> None:
         for entry, look in looks.items():
@@ -60,6 +61,8 @@ class ScalarExchange:
             for entry, (look, when) in told.items():
                 if when == step - self.wait:
                     self.has[i][j][entry] = joined(look, self.has[i][j].get(entry, NOTHING))
+        offers = [entry for _, entry in sorted(self._offers(i, step))]
+        self.waits[i] = sum(self.sizes[entry] for entry in offers)
         if left is not None and left < 2:
             return 0
         acks, spent, said = [], 2, {}
@@ -69,7 +72,7 @@ class ScalarExchange:
                 spent += 2
         if left is not None:
             left -= spent
-        for _, entry in sorted(self._offers(i, step)):
+        for entry in offers:
             if left is not None and self.sizes[entry] > left:
                 continue
             said[entry] = self.known[i][entry]
@@ -87,6 +90,7 @@ class ScalarExchange:
                 self.lost += not hears[k][i]
                 if hears[k][i]:
                     self.flying.append((step + self.delay, i, k, said, acks))
+        self.waits[i] -= sum(self.sizes[entry] for entry in said)
         return spent + sum(self.sizes[entry] for entry in said)
 
     def _offers(self, i: int, step: int) -> list:

@@ -34,6 +34,8 @@ class Episode:
     """[radios, X, Y] at each step: the last step at which each cell was seen, -1 for never"""
     known: list[Any] = field(default_factory=list)
     """[radios] at each step: cells known to have burned"""
+    waits: list[Any] = field(default_factory=list)
+    """[uavs] at each step: bytes of reports that did not fit; only with `env.radio.bandwidth`"""
     arrival: Any = None
     burn_out: Any = None
 
@@ -60,7 +62,7 @@ def play_small(*overrides: str) -> Episode:
                 action = torch.rand(2, config.env.num_uavs, 3, generator=draw) * 2 - 1
             td = env.step(td.set(keys.ACTION, action))
             returned, td = td["next"], step_mdp(td, keep_other=True)
-        recorder.add(world, returned)
+        recorder.add(env, returned)
         _keep(episode, world, returned[member].clone(), member)
     episode.recording = recorder.recording()
     return episode
@@ -73,3 +75,5 @@ def _keep(episode: Episode, world: Any, now: Any, member: int) -> None:
     sensor, knowledge = world._map._sensor, world.knowledge
     episode.knowledge.append(sensor.crop(knowledge.last_seen[member]).clone())
     episode.known.append(knowledge.seen_fire[member].sum(-1))
+    if world.config.radio.bandwidth is not None:
+        episode.waits.append(world._measures.reports.waits[member, :-1].tolist())

@@ -61,6 +61,8 @@ class Exchange(nn.Module):
     """int32 [envs, delay + 1, r, items]: the codes in flight of the entries said at a step"""
     acknowledged: Tensor
     """bool [envs, r, r]: the messages of a radio (row) that others acknowledged at the last step"""
+    waits: Tensor
+    """int64 [envs, r]: bytes of the entries that did not fit at the last step"""
     sizes: Tensor
     _first: Tensor
 
@@ -83,6 +85,8 @@ class Exchange(nn.Module):
         self.register_buffer("pending", torch.zeros(self.shape, dtype=torch.bool))
         pairs = envs, radios, radios
         self.register_buffer("contact", torch.zeros(pairs, dtype=torch.bool))
+        waits = torch.zeros(pairs[:2], dtype=torch.int64)
+        self.register_buffer("waits", waits, persistent=False)
         if free:
             return
         for name in ("got", "acknowledged"):
@@ -186,11 +190,12 @@ class Exchange(nn.Module):
         if waits is not None:
             says = says & ~waits
         if left is not None and recent is not None and told is not None:
-            size = self.sizes[entry % items]
+            size, wanted = self.sizes[entry % items], says.clone()
             says &= size <= left.view(-1)[row]
             expected = torch.where(recent.unsqueeze(-1), merged(theirs, told.unsqueeze(-1)), theirs)
             gain = (self._gain(mine.unsqueeze(-1), expected) * lacks).sum(-1)[says]
             says[says.clone()] = self._fits(entry[says], gain, size[says], left.view(-1))
+            self.waits.zero_().view(-1).index_add_(0, row, size * (wanted & ~says))
         entry, mine = entry[says], mine[says]
         if not self.free:
             self.told.view(-1)[entry] = mine

@@ -134,6 +134,7 @@ def test_messages_equal_plain_python_one_by_one(seed, unit, **radio):
             spent, got = scalar.step(step, near[e].tolist(), hears[e].tolist(), limits)
             assert sent[e].tolist() == spent
             assert arrives[e].tolist() == got
+            assert exchange.waits[e].tolist() == scalar.waits
             assert left is None or (sent <= left).all()
             assert scalar.sent == scalar.lost + scalar.arrived + len(scalar.flying)
             for uav in range(UAVS):

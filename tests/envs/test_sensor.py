@@ -136,10 +136,10 @@ def test_a_recording_knows_what_was_recognised():
     env = make_env("independent", "tuned", world="front", seed=1, num_train_fires=2, horizon=60,
                    sensor=[0.3, 0.05], num_uavs=3)  # fmt: skip
     recorder, td, policy = Recorder(), env.reset(), MapGreedy(env.base_env)
-    recorder.add(env.base_env, td)
+    recorder.add(env, td)
     for _ in range(60):
         td = env.step(policy.fly(td, torch.full((1, 3, 3), 30.0)))["next"]
-        recorder.add(env.base_env, td)
+        recorder.add(env, td)
     recorded = recorder.recording()
     assert (recorded.first_seen <= 60).sum() == td[keys.SEEN].item() > 0
     assert recorded.steps["missed"][1:].any((1, 2, 3)).all()

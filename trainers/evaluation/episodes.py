@@ -63,7 +63,7 @@ def recorder_of(config: RunConfig, policy: Any, member: int = 0) -> Recorder:
     """Returns a recorder of a policy's episode in environment `member`."""
     written = build_comm(config, 1).out_keys
     advised = any(key in written for key in getattr(policy, "in_keys", ()))
-    return Recorder(member=member, advised=advised, hears=getattr(policy, "hears", False))
+    return Recorder(policy, member=member, advised=advised)
 
 
 def title_of(config: RunConfig, *more: str) -> str:

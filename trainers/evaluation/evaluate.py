@@ -42,7 +42,7 @@ BLOCK = 50
 """environments in a batch of an evaluation, even if fewer episodes are needed"""
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
-Watch = Callable[[WildfireEnv, TensorDictBase], None]
+Watch = Callable[[TransformedEnv, TensorDictBase], None]
 """called at each step, from 0 to the horizon, with the environments and their output: the result
 of the reset, or the "next" of the step"""
 
@@ -66,7 +66,7 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
     with torch.no_grad():
         td = env.reset()
         if watch is not None:
-            watch(world, td)
+            watch(env, td)
         for _ in range(world.max_steps):
             td = env.step(policy(td))
             actions.append(td.get(keys.ACTION))
@@ -75,7 +75,7 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
                 sent = policy.bytes_sent(after)  # its messages, not the method's
                 after.update({} if sent is None else {keys.BYTES_SENT: sent})
             if watch is not None:
-                watch(world, after)
+                watch(env, after)
             steps.append(metrics.measured_steps(after.unsqueeze(1)))
             td = step_mdp(td, keep_other=True)
     wrong = ~torch.stack(actions).isfinite()

@@ -103,6 +103,7 @@ def _panel(shown: Episode) -> dict[str, Any]:
         "side": Sensor.of(world).side,
         "slope": math.tan(math.radians(world.view_angle)),
         "fails": fails,
+        **({"delay": world.radio.delay} if world.radio.packets else {}),
         "steps": {name: _rows(values) for name, values in steps.items()},
     }
 

@@ -9,11 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.envs import TransformedEnv
 
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.wildfire import WildfireEnv
+from emberlink.envs.world.exchange import Exchange
 from emberlink.envs.world.measures import age_limits, whole_steps
 from emberlink.envs.world.radio import Channel
 from emberlink.envs.world.sensor import Sensor
@@ -43,7 +44,8 @@ class Recording:
     - position: float32 [n, 3], cells; alive: bool [n]; reward: float32 [n], 0 at step 0
     - view: int [n, 4], the first and last cell in view along x, then along y; (1, 0, 1, 0) for none
     - hears: bool [r, r], whether a radio (row) heard another one (column); lost: bool [r, r],
-      whether it was in range but the message was lost
+      whether it was in range but the message was lost; both at the step of sending
+    - waits: int64 [n], bytes that did not fit into the step; only with `env.radio.bandwidth`
     - missed: bool [n, W, W], the cells of the view, from its first along x and y, that the UAV did
       not recognise; only with `env.sensor`
     - `COUNTS`, `OF_BASE` with a base, `ADVICE` if the policy follows it
@@ -119,20 +121,21 @@ class Episode:
 class Recorder:
     """Records the episode of one environment; `add` is called at each step.
 
-    It computes views and links again, which the environment does not show. `member` is the index of
-    the environment; `advised` tells whether the policy reads the advice of the communication, and
-    `hears` whether it receives messages by itself.
+    It computes views and links again, which the environment does not show. `policy` may exchange
+    messages by itself; `member` is the index of the environment; `advised` tells whether the policy
+    reads the advice of the communication.
     """
 
-    def __init__(self, *, member: int = 0, advised: bool = True, hears: bool = False):
-        self._member, self._advised, self._hears = member, advised, hears
+    def __init__(self, policy: Any = None, *, member: int = 0, advised: bool = True):
+        self._policy, self._member, self._advised = policy, member, advised
+        self._hears = getattr(policy, "hears", False)
         self._steps: dict[str, list[NDArray[Any]]] = {}
 
-    def add(self, world: WildfireEnv, td: TensorDictBase) -> None:
+    def add(self, env: TransformedEnv, td: TensorDictBase) -> None:
         """Adds one step, at which the environments returned `td`: of a reset, or its "next"."""
         now: Any = td[self._member : self._member + 1].cpu()
         if not self._steps:
-            self._start(world)
+            self._start(env)
         wanted = {"position": keys.POSITION, "alive": keys.ALIVE, **COUNTS, **OF_BASE}
         if self._advised:
             self._hears |= now.get(keys.HEARS, None) is not None
@@ -153,8 +156,11 @@ class Recorder:
             world=self._config, listens=listens, ignition=ignition, end=end, steps=steps
         )
 
-    def _start(self, world: WildfireEnv) -> None:
-        """Takes the fire of the environment."""
+    def _start(self, env: TransformedEnv) -> None:
+        """Takes the fire of the environment, and finds the radios."""
+        world: Any = env.base_env
+        parts = nn.ModuleList([env, *([self._policy] if self._policy else ())]).modules()
+        self._exchanges = [part for part in parts if isinstance(part, Exchange)]
         self._config, self._sensor = world.config, Sensor.of(world.config)
         arrival, burn_out = world.arrival_time[self._member].cpu(), world.burn_out
         end = torch.full_like(arrival, torch.inf) if burn_out is None else burn_out[self._member]
@@ -168,7 +174,15 @@ class Recorder:
         near, hears = self._channel(position, key, step, alive)
         looks = alive & (step > 0)  # nobody looks at the reset
         view = self._view(position, looks)
-        found = {"view": view, "hears": hears, "lost": near & ~hears}
+        found = {"view": view}
+        if self._config.radio.bandwidth is not None:  # a radio may say nothing, as it does not fit
+            says = now.get(keys.BYTES_SENT, alive).unsqueeze(1) > 0
+            says = nn.functional.pad(says, (0, near.shape[1] - says.shape[2]), value=True)
+            near, hears = near & says, hears & says
+            uavs, none = alive.shape[1], torch.zeros_like(alive, dtype=torch.int64)
+            waits = (one.waits[self._member, :uavs].cpu() for one in self._exchanges)
+            found["waits"] = sum(waits, none)
+        found |= {"hears": hears, "lost": near & ~hears}
         if self._config.sensor != (1.0, 1.0):
             found["missed"] = self._missed(position, looks, key, step, view)
         return found

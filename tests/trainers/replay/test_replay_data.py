@@ -55,6 +55,21 @@ def test_numbers_of_every_step_are_those_of_the_environment(episode, data):
             assert (step < panel["fails"][uav]) == now[keys.ALIVE][uav].item()
 
 
+def test_a_limited_radio_records_what_waits_and_the_links_of_those_that_speak(data):
+    (plain,) = data["panels"]
+    limits = "env.radio.bandwidth=12", "env.radio.delay=2", "env.radio.loss=0"
+    limited = play_small(*limits)
+    (panel,) = data_of(Replay([Episode(title="", recording=limited.recording)], "").html)["panels"]
+    assert not {"delay", "waits"} & {*plain}
+    assert panel["delay"] == 2
+    assert [[*row] for row in zip(*panel["waits"], strict=True)] == limited.waits
+    assert {n > 0 for row in limited.waits for n in row} == {True, False}
+    for step, now in enumerate(limited.steps):
+        for source, sent in enumerate(now[keys.BYTES_SENT].tolist()):
+            heard = [panel["hears"][4 * taker + source][step] == "1" for taker in range(3)]
+            assert heard == (now[keys.HEARS][:, source] & (sent > 0)).tolist()
+
+
 def _map(flat) -> list[list[int]]:
     return [flat[x * SIDES[1] : (x + 1) * SIDES[1]] for x in range(SIDES[0])]
 

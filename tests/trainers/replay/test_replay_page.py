@@ -8,9 +8,10 @@ import torch
 from browser import Tab, chromium
 from small_episode import SIDES, STEPS, play_small
 
-from emberlink.envs import keys
+from emberlink.envs import WildfireConfig, keys
+from emberlink.envs.config import RadioConfig
 from emberlink.trainers.replay.page import Replay
-from emberlink.trainers.replay.recording import Episode
+from emberlink.trainers.replay.recording import Episode, Recording
 
 pytestmark = pytest.mark.slow
 
@@ -61,6 +62,48 @@ def tab(request, browser, file):
     opened.close()
     assert opened.problems == []
     assert opened.requests == [f"file://{file}"]
+
+
+def test_a_late_message_holds_what_was_known_when_it_was_sent(browser, tmp_path):
+    """UAV 1 sees a fire at step 2, UAV 0 hears UAV 1 at step 4, UAV 2 UAV 0 from step 6 to 8."""
+    steps, uavs = 13, 3
+    ignition = np.full((8, 8), steps)
+    ignition[5, 5] = 0
+    values = {"position": np.ones((steps, uavs, 3), np.float32)}
+    values |= {"alive": np.ones((steps, uavs), bool), "reward": values["position"][..., 0]}
+    values |= {"view": np.tile([1, 0, 1, 0], (steps, uavs, 1))}
+    values |= {name: np.zeros((steps, uavs, uavs), bool) for name in ("hears", "lost")}
+    values |= {name: np.zeros(steps, int) for name in ("seen", "burning", "burnt")}
+    values["waits"] = np.arange(steps * uavs).reshape(steps, uavs)
+    values["view"][2, 1] = 5, 5, 5, 5
+    for step, taker, source in ((4, 0, 1), (6, 2, 0), (7, 2, 0), (8, 2, 0)):
+        values["hears"][step, taker, source] = True
+    world = WildfireConfig(
+        grid=(8, 8), num_uavs=uavs, horizon=steps - 1, radio=RadioConfig(delay=3, bandwidth=9)
+    )
+    end = np.full_like(ignition, steps)
+    made = Recording(world=world, listens=True, ignition=ignition, end=end, steps=values)
+    Replay([Episode(title="late", recording=made)], "").save(tmp_path / "page.html")
+    tab = Tab(browser, f"file://{tmp_path / 'page.html'}")
+    tab.page.wait_for_selector("#curves .uplot")
+    assert "at most" in tab.page.inner_text("#layers")
+    assert "in flight" in tab.page.inner_text("#legend")
+    shown = {}
+    for step in (*range(steps), 6):  # the last one backwards
+        go_to(tab, step)
+        for uav in range(uavs):
+            tab.page.select_option("#uav", str(uav))
+            numbers = [
+                tab.page.inner_text(f"[data-number={name}]")
+                for name in ("known", "flying", "waits")
+            ]
+            shown[step, uav] = [int(number) for number in numbers]
+    known = {0: 4 + 3, 1: 2, 2: 8 + 3}
+    sent = {0: (4,), 1: (), 2: (6, 7, 8)}
+    for (step, uav), numbers in shown.items():
+        flying = sum(0 <= step - then < 3 for then in sent[uav])
+        assert numbers == [step >= known[uav], flying, 3 * step + uav]
+    tab.close()
 
 
 def step_of(tab) -> int:

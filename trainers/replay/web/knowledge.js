@@ -35,8 +35,8 @@ export function burns(data, cell, step) {
 
 /**
  * Stores for each radio the last step at which each cell was seen, by it or by those whose messages
- * arrived, and whether it knows of a sighting of the cell while it burned. The last map is that of
- * the team: what any UAV has seen.
+ * arrived, and whether it knows of a sighting of the cell while it burned. A message holds all that
+ * its radio knows. The last map is that of the team: what any UAV has seen.
  */
 export class Knowledge {
   constructor(data, panel) {
@@ -46,7 +46,7 @@ export class Knowledge {
     const maps = panel.radios + 1;
     this.last = Array.from({ length: maps }, () => new Int32Array(cells).fill(NEVER));
     this.fire = Array.from({ length: maps }, () => new Uint8Array(cells));
-    this.reach = identity(panel.radios);
+    this.news = [new Int32Array(panel.radios * panel.uavs)];
     this.step = 0;
     const stored = Math.min(40, Math.max(2, Math.floor(MEMORY / (maps * cells * 5))));
     this.interval = Math.max(25, Math.ceil(panel.horizon / stored));
@@ -54,11 +54,7 @@ export class Knowledge {
   }
 
   copy() {
-    return {
-      last: this.last.map((map) => map.slice()),
-      fire: this.fire.map((map) => map.slice()),
-      reach: this.reach.slice(),
-    };
+    return { last: this.last.map((map) => map.slice()), fire: this.fire.map((map) => map.slice()) };
   }
 
   /** Goes to a step, from the nearest earlier one that is stored. */
@@ -69,7 +65,6 @@ export class Knowledge {
       const stored = this.stored.get(from);
       this.last.forEach((map, radio) => map.set(stored.last[radio]));
       this.fire.forEach((map, radio) => map.set(stored.fire[radio]));
-      this.reach = stored.reach.slice();
       this.step = from;
     }
     while (this.step < step) {
@@ -82,41 +77,57 @@ export class Knowledge {
 
   /** Adds the sightings and messages of a step. */
   advance(step) {
-    const { panel, data } = this;
-    const reach = reachable(panel, step);
-    const { radios } = panel;
+    const { panel } = this;
+    const [before, now] = [this.newsAt(step - 1), this.newsAt(step)];
     for (let uav = 0; uav < panel.uavs; uav++) {
-      const takers = [radios]; // the team
-      for (let radio = 0; radio < radios; radio++) {
-        if (reach[radio * radios + uav]) takers.push(radio);
+      for (let radio = 0; radio < panel.radios; radio++) {
+        const source = radio * panel.uavs + uav;
+        for (let at = before[source] + 1; at <= now[source]; at++) this.look(radio, at, uav);
       }
-      eachInView(panel, data.rows, step, uav, (cell) => {
-        const burning = burns(data, cell, step);
-        for (const taker of takers) {
-          this.last[taker][cell] = step;
-          if (burning) this.fire[taker][cell] = 1;
-        }
-      });
+      this.look(panel.radios, step, uav); // the team
     }
-    // Radios that stay in contact already know the same: only new contacts compare whole maps.
-    for (let taker = 0; taker < radios; taker++) {
-      for (let source = 0; source < radios; source++) {
-        const link = taker * radios + source;
-        if (reach[link] && !this.reach[link]) this.merge(taker, source);
-      }
-    }
-    this.reach = reach;
     this.step = step;
   }
 
-  /** Gives a radio all that another one knows. */
-  merge(taker, source) {
-    const [mine, other] = [this.last[taker], this.last[source]];
-    const [myFire, otherFire] = [this.fire[taker], this.fire[source]];
-    for (let cell = 0; cell < mine.length; cell++) {
-      if (other[cell] > mine[cell]) mine[cell] = other[cell];
-      myFire[cell] |= otherFire[cell];
+  /** Enters into a map what a UAV saw at a step. */
+  look(map, step, uav) {
+    const { panel, data } = this;
+    eachInView(panel, data.rows, step, uav, (cell) => {
+      if (step > this.last[map][cell]) this.last[map][cell] = step;
+      if (burns(data, cell, step)) this.fire[map][cell] = 1;
+    });
+  }
+
+  /** Returns the step up to which each radio (row) knows the sightings of each UAV (column). */
+  newsAt(step) {
+    const { delay = 0 } = this.panel;
+    for (let at = this.news.length; at <= step; at++) {
+      const news = this.said(at);
+      if (at > delay) this.hear(news, at - delay);
+      this.news.push(news);
     }
+    return this.news[step];
+  }
+
+  /** Adds what the radios said at a step to the news of those that heard it. */
+  hear(news, then) {
+    const { radios, uavs } = this.panel;
+    const said = this.said(then);
+    for (let taker = 0; taker < radios; taker++) {
+      for (const source of sources(this.panel, then, taker)) {
+        for (let uav = 0; uav < uavs; uav++) {
+          const place = taker * uavs + uav;
+          news[place] = Math.max(news[place], said[source * uavs + uav]);
+        }
+      }
+    }
+  }
+
+  /** Returns the same as the radios say it at a step, before they hear anything. */
+  said(step) {
+    const news = this.news[step - 1].slice();
+    for (let uav = 0; uav < this.panel.uavs; uav++) news[uav * this.panel.uavs + uav] = step;
+    return news;
   }
 
   /** Returns the number of cells of which a radio knows a sighting made while they burned. */
@@ -125,25 +136,17 @@ export class Knowledge {
   }
 }
 
-function identity(size) {
-  return Uint8Array.from({ length: size * size }, (_, at) => at % (size + 1) === 0);
-}
-
-/** Returns whose messages arrive at each radio, directly or passed on (a radio has a row). */
-function reachable(panel, step) {
-  const { radios } = panel;
-  const reach = identity(radios);
-  for (let radio = 0; radio < radios; radio++) {
-    const waiting = [radio];
-    while (waiting.length) {
-      const taker = waiting.pop();
-      for (let source = 0; source < radios; source++) {
-        if (!reach[radio * radios + source] && panel.hears(step, taker * radios + source)) {
-          reach[radio * radios + source] = 1;
-          waiting.push(source);
-        }
-      }
+/**
+ * Returns the radios whose messages of a step arrive at a radio. If messages are neither late nor
+ * limited, they are passed on within the step.
+ */
+function sources(panel, step, taker) {
+  const found = new Set([taker]);
+  for (const radio of found) {
+    for (let source = 0; source < panel.radios; source++) {
+      if (panel.hears(step, radio * panel.radios + source)) found.add(source);
     }
+    if (panel.delay !== undefined) break;
   }
-  return reach;
+  return found;
 }

@@ -5,6 +5,7 @@ import { uavStyle } from "./palette.js";
 
 const TRAIL = 80; // steps
 const MANY = 16; // UAVs above which links are thin and targets have no lines
+const FLIGHT = [5, 5]; // dashes of links over which messages are on their way
 const ROLE_COLOURS = ["--discoverer", "--seeker", "--wanderer"];
 const SHAPES = [ // of the roles: corners right and down of the middle
   [[0, -1.75], [1.75, 0], [0, 1.75], [-1.75, 0]],
@@ -183,23 +184,38 @@ export class MapView {
     }
   }
 
-  /** Draws half a line, up to the middle, at each radio that heard another one. */
+  /** Returns the number of messages on their way to a radio from one other, or from all. */
+  flying(taker, source = null) {
+    const { radios, hears, delay = 0 } = this.panel;
+    let count = 0;
+    for (let step = Math.max(0, this.step - delay + 1); step <= this.step; step++) {
+      for (let from = source ?? 0; from <= (source ?? radios - 1); from++) {
+        count += hears(step, taker * radios + from);
+      }
+    }
+    return count;
+  }
+
+  /** Draws half a line, up to the middle, at each radio that hears another one, or will. */
   drawLinks() {
     const { panel } = this;
     const many = panel.uavs > MANY;
+    const sent = this.step - (panel.delay ?? 0);
     for (let taker = 0; taker < panel.radios; taker++) {
       for (let source = 0; source < panel.radios; source++) {
         const link = taker * panel.radios + source;
-        const heard = panel.hears(this.step, link);
+        const heard = sent >= 0 && panel.hears(sent, link);
+        const comes = heard || (panel.delay && this.flying(taker, source));
         const lost = this.options.lost && panel.lost?.(this.step, link);
-        if (!heard && !lost) continue;
+        if (!comes && !lost) continue;
         const [from, to] = [this.radio(taker), this.radio(source)];
         const middle = from.map((value, axis) => (value + to[axis]) / 2);
-        if (!many && !lost) {
-          this.line("--view-edge", 4);
+        if (!many && comes) {
+          this.line("--view-edge", 4, heard ? [] : FLIGHT);
           this.stroke(from, middle);
         }
-        this.line(lost ? "--lost" : "--link", many ? 1 : 2, lost ? [3, 3] : []);
+        if (comes) this.line("--link", many ? 1 : 2, heard ? [] : FLIGHT);
+        else this.line("--lost", many ? 1 : 2, [3, 3]);
         this.stroke(from, middle);
         if (lost) this.cross(from.map((value, axis) => 0.45 * value + 0.55 * middle[axis]), 4, "--lost");
       }
@@ -245,9 +261,27 @@ export class MapView {
     pen.strokeRect(right - half, down - half, 2 * half, 2 * half);
   }
 
+  /** Writes the bytes that wait at a UAV beside it, within the map. */
+  drawWaiting(uav) {
+    const bytes = this.panel.waits?.(this.step, uav);
+    if (!bytes || !this.flies(uav) || (this.panel.uavs > MANY && uav !== this.options.uav)) return;
+    const { pen, half } = this;
+    const [right, down] = this.radio(uav);
+    pen.font = "600 11px system-ui, sans-serif";
+    [pen.textAlign, pen.textBaseline] = ["left", "middle"];
+    const width = pen.measureText(bytes).width + 6;
+    const left = Math.min(right + half + 2, this.canvas.clientWidth - width);
+    const middle = Math.max(down - half - 4, 7);
+    pen.fillStyle = this.options.palette.named("--view-edge");
+    pen.fillRect(left, middle - 7, width, 14);
+    pen.fillStyle = this.options.palette.named("--view");
+    pen.fillText(bytes, left + 3, middle + 0.5);
+  }
+
   drawUavs() {
     const { uav: chosen } = this.options;
     const others = Array.from({ length: this.panel.uavs }, (_, uav) => uav).filter((uav) => uav !== chosen);
+    if (this.options.links) for (const uav of [...others, chosen]) this.drawWaiting(uav);
     for (const uav of [...others, chosen]) { // the chosen one on top
       const place = this.radio(uav);
       if (this.flies(uav)) this.drawUav(uav, place);

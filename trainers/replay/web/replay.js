@@ -32,12 +32,14 @@ function numbers(panel, step) {
 }
 
 /** The numbers of the chosen UAV. */
-function uavNumbers(panel, knowledge, step, uav) {
+function uavNumbers(panel, knowledge, map, step, uav) {
   const rows = [
-    ["known", "knows", knowledge.known(uav), 0, " cells of fire"],
+    ["known", panel.delay === undefined ? "knows" : "knows at most", knowledge.known(uav), 0, " cells of fire"],
     ...["x", "y", "z"].map((name, axis) =>
       [name, name, panel.position(step, uav * 3 + axis) / 100, 2, ""]),
   ];
+  if (panel.delay) rows.push(["flying", "in flight to it", map.flying(uav), 0, " messages"]);
+  if (panel.waits) rows.push(["waits", "waiting", panel.waits(step, uav), 0, " bytes"]);
   return step ? [["reward", "reward", panel.reward(step, uav), 2, ""], ...rows] : rows;
 }
 
@@ -94,12 +96,15 @@ class Player {
     const offered = {
       base: panels.some((panel) => panel.base),
       lost: panels.some((panel) => panel.lost),
+      late: panels.some((panel) => panel.delay),
+      packets: panels.some((panel) => panel.delay !== undefined),
+      waits: panels.some((panel) => panel.waits),
       roles: panels.some((panel) => panel.follows),
       failed: panels.some((panel) => panel.fails.some((step) => step <= horizon)),
     };
     for (const [name, there] of Object.entries({ ...offered, burnt: burnsOut })) {
       const control = find(name)?.closest("label");
-      const entries = document.querySelectorAll(`#legend .of-${name}`);
+      const entries = document.querySelectorAll(`.of-${name}`);
       for (const part of [...entries, ...(control ? [control] : [])]) part.hidden = !there;
     }
   }
@@ -239,7 +244,7 @@ class Player {
       const role = map.role(own);
       const told = role === null || !map.flies(own) ? "" : `, ${this.data.roles[role]}`;
       const who = `UAV ${own}${map.flies(own) ? "" : ", failed"}${told}:`;
-      list(part("of-uav"), who, uavNumbers(panel, knowledge, step, own));
+      list(part("of-uav"), who, uavNumbers(panel, knowledge, map, step, own));
     }
     find("slider").value = step;
     find("slider").setAttribute("aria-valuetext", `step ${step} of ${this.data.horizon}`);
