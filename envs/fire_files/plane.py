@@ -54,10 +54,7 @@ def choose_plane(crs: Any, wanted: str | None, bounds: Bounds) -> Plane:
     if not (crs and wanted) and ratio <= _BENT:
         return Plane(f"projection {source.name} ({shape})", source)
     box = library("geopandas").GeoSeries([library("shapely").box(*bounds)], crs=source)
-    try:
-        target = parse_crs(wanted) if crs and wanted else box.estimate_utm_crs()
-    except RuntimeError:
-        raise ask(f"{where}: no UTM zone is there", "fire.crs, in metres") from None
+    target = parse_crs(wanted) if crs and wanted else box.estimate_utm_crs()
     after, bent = _shape(target, source, bounds)
     if bent > _BENT:
         raise ask(f"fire.crs={wanted} has {after} here", "one as UTM is")

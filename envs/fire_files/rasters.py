@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import binary_erosion, map_coordinates, minimum_filter, minimum_filter1d
 
-from emberlink.envs.config import SIDES
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.files import first_line, library, members
 from emberlink.envs.fire_files.grid import Fire, Window
@@ -183,8 +182,6 @@ def _band(dataset: Any, last: bool, config: FileFireConfig) -> tuple[np.ndarray,
     what += f" ({declared})" if declared else ""
     values = _read(dataset, _MAX_CELLS, band)[0]
     nodata = dataset.read_masks(band) == 0
-    if "all_valid" in (flag.name for flag in dataset.mask_flag_enums[band - 1]):
-        nodata[:] = False
     values = values * dataset.scales[band - 1] + dataset.offsets[band - 1]
     name, _, since = declared.partition(" since ")
     known = next((u for u, form in _UNITS.items() if re.fullmatch(form, name, re.IGNORECASE)), None)
@@ -247,8 +244,6 @@ def _bank(
         keys = f"fire.unburned={values[most[0]]:g}", "fire.kind=masks", "fire.unburned=none"
         states = slice(1, None) if len(values) <= 6 and (values % 1 == 0).all() else slice(None)
         raise ask(f"{count} maps of the states {listed}, and no inf, never", *keys[states])
-    if not SIDES[0] <= min(columns, rows) <= max(columns, rows) <= SIDES[1]:
-        raise ask(f"fires of {columns} x {rows} cells", f"{SIDES[0]} to {SIDES[1]}")
     if config.units not in (None, "steps") and config.test is None:  # no other file has units
         raise ask(f"fire.units={config.units}: a bank is in steps", "none")
     card = path.with_suffix(".json")

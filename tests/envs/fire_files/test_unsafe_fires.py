@@ -175,7 +175,6 @@ def test_values_that_are_no_times(tmp_path):
     refused(write_tif(path, times, crs="EPSG:4326"), "are not the degrees of WGS 84")
     small = rasterio.Affine(0.001, 0, -117, 0, -0.001, 45)
     refused(write_tif(path, times, crs=None, transform=small), "may be degrees.*fire.crs=EPSG:4326")
-    refused(write_tif(path, times), "fire.incident chooses among perimeters", incident="Creek")
 
 
 def test_geometries_that_enclose_nothing(tmp_path):
