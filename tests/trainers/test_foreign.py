@@ -190,7 +190,9 @@ def test_comparisons_and_replays_read_its_folder(source, capsys):
         words = f"eval mine.py:turn independent {options} seed={seed} --name turner"
         assert main(words.split()) == 0
     folders = sorted(Path("runs").iterdir())
-    table = trainers.compare("runs").ranking
+    table = trainers.compare("runs", "compared").ranking
+    page = Path("compared/compare.html").read_text()
+    assert page.count("<img") == 1, "no curves of trainings that were not"
     assert set(table["label"]) == {"turner"}
     assert table["seeds"].iloc[0] == [0, 1]
     again = json.loads((folders[0] / "eval.json").read_text())["results"]

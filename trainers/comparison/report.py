@@ -239,7 +239,7 @@ def _chapter(
         for i, (fires, part) in enumerate(ranking.groupby("fires", sort=False), 1)
     ]
     training = []
-    for number, (measures, content) in drawing.FIGURES.items():
+    for number, (measures, content) in drawing.FIGURES.items() if len(curves) else ():
         caption = f"The paper's figure {number}. {content} {drawing.CURVES_CAPTION}"
         figure = drawing.training(curves, scripted, measures, labels)
         training.append(saved(figure, f"figure_{number}", caption))
