@@ -36,13 +36,14 @@ class Tracker:
                 self.log(line)
 
     def log(self, line: Mapping[str, float]) -> None:
-        """Logs a line of metrics.jsonl, with its episode as the step."""
+        """Logs a line of metrics.jsonl in the sections `training` and `validation`."""
+        parts = {f"{'validation' if '/' in n else 'training'}/{n}": v for n, v in line.items()}
         more = {"override_global_step": True} if self._name == "wandb" else {}
         if logger := self._logger:
-            self._tried(lambda: logger.log_metrics(dict(line), step=int(line["episode"]), **more))
+            self._tried(lambda: logger.log_metrics(parts, step=int(line["episode"]), **more))
 
     def log_evaluation(self, numbers: Mapping[str, float], figures: Sequence[Path]) -> None:
-        """Logs the final evaluation: means by name, and PNG files."""
+        """Logs the final evaluation: means by name, PNG files and, to wandb, GIF files."""
         if logger := self._logger:
             self._tried(lambda: _log_at_the_end(logger, dict(numbers), figures, self._episodes))
 
@@ -121,14 +122,16 @@ def _log_at_the_end(
     logger: Any, numbers: dict[str, float], figures: Sequence[Path], episode: int
 ) -> None:
     """Logs the final evaluation: to wandb's summary, else at the step of the last episode."""
-    experiment, images = logger.experiment, {f"figures/{path.stem}": path for path in figures}
+    experiment, named = logger.experiment, {f"figures/{path.stem}": path for path in figures}
     if hasattr(experiment, "summary"):
         import wandb
 
-        pictures = {name: wandb.Image(str(path)) for name, path in images.items()}
-        experiment.summary.update({**numbers, **pictures})
+        kinds = {".png": wandb.Image, ".gif": wandb.Video}
+        shown = {name: kinds[path.suffix](str(path)) for name, path in named.items()}
+        experiment.summary.update({**numbers, **shown})
         return
     logger.log_metrics(numbers, step=episode)
+    images = {name: path for name, path in named.items() if path.suffix == ".png"}
     for name, path in images.items() if hasattr(experiment, "add_image") else ():
         pixels = np.asarray(Image.open(path).convert("RGB"))
         experiment.add_image(name, pixels, episode, dataformats="HWC")

@@ -90,8 +90,13 @@ def means(run: RunFolder) -> dict[str, float]:
     }
 
 
-def figures(run: RunFolder) -> set[str]:
-    return {f"figures/{file.stem}" for file in (run.path / "figures").glob("*.png")}
+def figures(run: RunFolder, *kinds: str) -> set[str]:
+    files = (run.path / "figures").iterdir()
+    return {f"figures/{file.stem}" for file in files if file.suffix in kinds}
+
+
+def sections(line: dict[str, Any]) -> dict[str, Any]:
+    return {f"{'validation' if '/' in n else 'training'}/{n}": v for n, v in line.items()}
 
 
 def events_of(run: RunFolder) -> Any:
@@ -111,8 +116,8 @@ def scalars(run: RunFolder) -> dict[str, dict[int, float]]:
 
 def expected(run: RunFolder) -> dict[str, Any]:
     """Returns the episodes and the evaluation of a run, name -> step -> approximate number."""
-    lines = run.metrics()
-    names = {name for line in lines for name in line}
+    lines = [{**sections(line), "episode": line["episode"]} for line in run.metrics()]
+    names = {name for line in lines for name in line if name != "episode"}
     table = {n: {line["episode"]: line[n] for line in lines if n in line} for n in names}
     table |= {name: {len(lines): value} for name, value in means(run).items()}
     return {name: pytest.approx(values, rel=1e-6) for name, values in table.items()}
@@ -156,10 +161,10 @@ def test_wandb_has_every_episode_and_the_evaluation_in_its_summary(capfd):
     history = rows_of(run)
     assert [row["_step"] for row in history] == [1, 2, 3, 4]
     for row, line in zip(history, run.metrics(), strict=True):
-        assert {k: v for k, v in row.items() if not k.startswith("_")} == line
+        assert {k: v for k, v in row.items() if not k.startswith("_")} == sections(line)
     summary = summary_of(run)
     assert means(run).items() <= summary.items()
-    assert figures(run) <= summary.keys()
+    assert figures(run, ".png", ".gif") <= summary.keys()
     (about,) = (record.run for record in written(run) if record.HasField("run"))
     assert about.project == "emberlink"
     assert about.run_group == "tuned-paper"
@@ -206,10 +211,10 @@ def test_every_number_is_written_and_written_again_by_a_resume(logger, numbers):
     run = command(logger)
     assert numbers(run) == expected(run)
     if logger == "tensorboard":
-        assert set(events_of(run).Tags()["images"]) == figures(run)
+        assert set(events_of(run).Tags()["images"]) == figures(run, ".png")
     trainers.resume(run.path, episodes=6)
     assert numbers(run) == expected(run)
-    assert numbers(run)["coverage"].keys() == {1, 2, 3, 4, 5, 6}
+    assert numbers(run)["training/coverage"].keys() == {1, 2, 3, 4, 5, 6}
 
 
 def train(logger: str, folder: Path):

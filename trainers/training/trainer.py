@@ -67,6 +67,7 @@ class Trainer:
     def start(self) -> RunFolder:
         """Creates the run folder, locks it and returns it."""
         warm_start.start(self.setup.learner, self.config)  # before there are files
+        self.setup.load_learner(self.setup.state_dict())  # else only a resume tells that it fails
         run = RunFolder.create(self.config)
         self.open(run, Lock(run.path))
         return run
@@ -139,7 +140,7 @@ class Trainer:
         config, run = self.config, self.run
         policy = TrainedPolicy(self.setup.actor, config, run.checkpoint())
         results = evaluate_run(run, policy, report=report)
-        figures = sorted((run.path / "figures").glob("*.png"))
+        figures = sorted((run.path / "figures").glob("*.[pg][ni][gf]"))
         self.tracker.log_evaluation(learned_means(results), figures)
         return results
 

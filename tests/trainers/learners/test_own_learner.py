@@ -14,6 +14,7 @@ from emberlink import trainers
 from emberlink.envs.utils import config_files
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.setup import TrainingSetup
+from emberlink.trainers.training.trainer import Trainer
 
 PAGE = Path(__file__).parents[3] / "docs" / "extensions.md"
 SMALL = [
@@ -47,6 +48,17 @@ def made() -> TrainingSetup:
 def test_the_learner_of_the_page_trains_all_weights_and_resumes_bit_for_bit(sac):
     assert "log_alpha" in dict(made().learner.loss.named_parameters())
     check_that_it_learns_and_resumes(made)
+
+
+@pytest.mark.parametrize("member", ["state_dict", "load_state_dict"])
+def test_a_state_that_is_not_restored_fails_before_the_first_episode(sac, member, monkeypatch):
+    def fails(*_):
+        raise RuntimeError("no state")
+
+    trainer = Trainer(resolve("consensus", SMALL))
+    monkeypatch.setattr(trainer.setup.learner, member, fails)
+    with pytest.raises(RuntimeError, match="no state"):
+        trainer.start()
 
 
 def test_its_run_is_exported_flown_and_resumed(sac, tmp_path):
