@@ -31,7 +31,7 @@ demo: $(INSTALLED)  ## train a team in three minutes and evaluate it, with figur
 	@OMP_NUM_THREADS=$(THREADS) $(BIN)/emberlink train independent setup=strong $(DEMO)
 
 # Tests of a file run in one process, since they share trainings.
-test: $(INSTALLED)  ## run the tests, without the slow ones (about 5 minutes)
+test: $(INSTALLED)  ## run the tests, without the slow ones (under 4 minutes on two cores)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m "$(TESTS)"
 
 test-slow: $(INSTALLED) browser  ## run the slow tests (5 to 20 minutes)

@@ -5,6 +5,7 @@ import re
 import sys
 import warnings
 from contextlib import suppress
+from copy import deepcopy
 from functools import lru_cache
 from importlib import metadata
 from importlib.util import find_spec
@@ -76,13 +77,19 @@ def summary(group: str, name: str) -> str:
 
 def read(group: str, name: str) -> dict[str, Any]:
     """Returns the content of a configuration file, without the files in its `defaults`."""
-    from omegaconf import OmegaConf  # imported here, since `find` answers a mistyped name at once
-
     file = find(group, name)
     try:
-        values: Any = OmegaConf.to_container(OmegaConf.load(file))
+        values = deepcopy(_content(file, file.stat().st_mtime_ns))
     except Exception as error:  # of the file, YAML or OmegaConf
         raise UserError(f"{file}: cannot be read: {' '.join(str(error).split())[:200]}") from None
     if not isinstance(values, dict):
         raise UserError(f"{file}: expected keys and values")
     return values
+
+
+@lru_cache(maxsize=256)
+def _content(file: Path, _: int) -> Any:
+    """Reads a file once per modification: each composition asks for its learner's keys."""
+    from omegaconf import OmegaConf  # imported here, since `find` answers a mistyped name at once
+
+    return OmegaConf.to_container(OmegaConf.load(file))
