@@ -47,9 +47,6 @@ class Replay:
         """Writes the page to a file."""
         user_path(path).write_text(self.html, encoding="utf-8")
 
-    def __repr__(self) -> str:
-        return f"<Replay, {len(self.html) // 1000} kB of HTML>"
-
     def _repr_html_(self) -> str:
         """Returns the page in a frame, for Jupyter."""
         return (
