@@ -281,11 +281,12 @@ class Consensus(CommModule):
         key = counter_rng.step_key(steps.get(keys.RNG_KEY), step, use)
         points = motion.random_points(key, position.shape[-2], self.low, self.high)
         due = (step % every == 0)[..., None, None] & wanders if every else wanders & False
-        waypoints = []
+        waypoint, waypoints = self.waypoint, []
         for here, point, wander, draws in zip(position, points, wanders, due, strict=True):
-            reached = motion.distance(here, self.waypoint).unsqueeze(-1) < 1
-            self.waypoint.copy_(torch.where(reached & wander | draws, point, self.waypoint))
-            waypoints.append(self.waypoint.clone())
+            reached = motion.distance(here, waypoint).unsqueeze(-1) < 1
+            waypoint = torch.where(reached & wander | draws, point, waypoint)
+            waypoints.append(waypoint)
+        self.waypoint.copy_(waypoint)
         return torch.stack(waypoints)
 
     def _bonus(

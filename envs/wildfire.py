@@ -305,7 +305,7 @@ class WildfireEnv(EnvBase):
                 result, changed = self._communicate(steps, result)
                 parts[-1].update(changed)
         # [envs, steps], as the time steps of a rollout are
-        series: Any = torch.cat(parts).transpose(0, 1).contiguous()
+        series: Any = torch.cat([part.transpose(0, 1) for part in parts], 1)
         result.set(keys.STEPS, series).set(keys.REWARD, series.get(keys.REWARD).sum(1))
         return result.update(self._measured())
 
