@@ -67,8 +67,7 @@ def export(run: str | PathLike[str], file: str | Path) -> tuple[Path, Path]:
     path = new_file(Path(file), (".onnx",))
     card_path = new_file(path.with_suffix(".json"), (".json",))
     require("onnxscript", "export", "export")
-    folder = read_run(fspath(run))
-    if foreign_name(folder):
+    if foreign_name(folder := read_run(fspath(run))):
         raise UserError(f"{folder.path}: has no networks of emberlink to export")
     policy = load_policy(folder, device="cpu")
     decision = Decision(policy)

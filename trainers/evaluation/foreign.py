@@ -252,10 +252,6 @@ def _module(place: str) -> Any:
 def takes_state(policy: Callable[..., Any]) -> bool:
     """Returns whether a function, or a module's `forward`, has a second argument, None at first."""
     call = policy.forward if isinstance(policy, nn.Module) else policy
-    try:
-        parameters = inspect.signature(call).parameters.values()
-    except ValueError:  # of a function that is not written in Python
-        return False
     by_place = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    placed = [one for one in parameters if one.kind in by_place]
+    placed = [one for one in inspect.signature(call).parameters.values() if one.kind in by_place]
     return len(placed) > 1 and (placed[1].default is None or placed[1].default is placed[1].empty)

@@ -37,9 +37,8 @@ def _warn_of_other_observations(name: str, theirs: RunConfig, mine: RunConfig) -
     more = ("env.base",) if mine.env.observation == "map" else ()  # maps show the base
     more += ("env.radio.",) if MODULES.find(mine.comm["name"]).hears else ()
     for key, (before, now) in differences(theirs, mine).items():
-        if key.startswith((*_OBSERVED, *units(mine), *more)) and not key.startswith(
-            "comm.heading."
-        ):  # rewards
+        of_reward = key.startswith("comm.heading.")
+        if key.startswith((*_OBSERVED, *units(mine), *more)) and not of_reward:
             warnings.warn(
                 f"learner.warm_start={name}: its actors were trained with {key}={shown(before)}, "
                 f"this run has {shown(now)}",
