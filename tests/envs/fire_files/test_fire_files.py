@@ -68,7 +68,6 @@ def test_a_copy_is_used_for_its_own_grid_only_and_a_changed_file_is_named(source
     ("count", "train", "validation", "test"),
     [
         (1, [0], [0], [0]),
-        (2, [0], [0], [1]),
         (3, [0], [1], [2]),
         (5, [0, 1, 2], [3], [4]),
         (12, [0, 1, 2, 5, 6, 7, 10, 11], [3, 8], [4, 9]),

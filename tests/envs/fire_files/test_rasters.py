@@ -83,7 +83,6 @@ def test_bytes_with_nodata_scale_and_offset(tmp_path):
         ({"start": 5.0, "end": 10.0}, [0, 0, 20, INF]),  # cells that burn by then burn at 0
         ({"minutes_per_step": 2.0}, [0, 2.5, 5, 10]),
         ({"start": -10.0, "end": 30.0}, [5, 7.5, 10, 15]),
-        ({"units": "hours", "minutes_per_step": 60.0}, [0, 5, 10, 20]),
         ({"units": "days", "minutes_per_step": 1440.0, "start": 1.0}, [0, 4, 9, 19]),
         ({"units": "steps", "end": 10.0}, [0, 10, 20, INF]),
     ],

@@ -110,7 +110,6 @@ def test_no_regular_files_and_no_addresses(tmp_path, wholes):
         "pipe.tif": "no regular file",
         "loop.shp": "cannot be read|no such file",
         "none.gpkg": "no such file",
-        "x" * 300: "cannot be read",
         "empty": "a folder with 0 files of perimeters",
         "large.geojson": "150000001 bytes; .* at most 150000000",
     }.items():
@@ -143,7 +142,6 @@ def test_links_declarations_and_sizes_in_texts_are_refused(tmp_path, wholes):
         ("fire.asc", rows.replace("NCOLS 40", "NCOLS 1000000000"), "40 x 1000000000|expected"),
         ("fire.json", json.dumps({**whole, "crs": link}), "crs is a link, which is not followed"),
         ("fire.json", '{"a":' * 100_000, "levels|recursion|expected"),
-        ("fire.json", json.dumps({**whole, "crs": None, "type": "Topology"}), "'Topology'"),
         ("fire.kml", f'<!DOCTYPE kml [<!ENTITY a "aaaa">]>{kml}', "document type declaration"),
     ):
         (tmp_path / name).write_text(text)
