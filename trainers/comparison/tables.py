@@ -19,8 +19,8 @@ from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import without_time_and_seed
 
 NOT_COMPARED = (
-    *("seed", "seeds", "output", "evaluation", "baselines", "device", "logger", "on_nan"),
-    *("checkpoint_interval", "checkpoint_steps", "keep_checkpoints"),
+    *("seed", "output", "evaluation", "device", "logger"),
+    *("checkpoint_interval", "checkpoint_steps"),
 )
 """first parts of keys that do not affect training"""
 WARM_START = "learner.warm_start"
