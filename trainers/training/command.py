@@ -100,7 +100,8 @@ def _notes(trainer: Trainer) -> Iterator[str]:
         )
     if trainer.setup.step:
         return  # the files of the setup may have gone since
-    usual = resolve("independent", [f"setup={config.setup}", f"world={config.world}"])
+    chosen = f"setup={config.setup}", f"world={config.world}", "fire=paper"  # which needs no file
+    usual = resolve("independent", chosen)
     rewards = {k: v for k, v in differences(config, usual).items() if k.startswith("env.reward.")}
     for key, (own, other) in rewards.items():
         yield f"{key} is {own} here and {other} for independent: their rewards do not compare"

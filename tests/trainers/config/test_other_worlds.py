@@ -152,6 +152,15 @@ def test_a_run_is_evaluated_on_a_fire_of_a_file(run, tmp_path):
     assert policy.config.fire.path == str(tmp_path / "fire.asc")
 
 
+def test_a_run_is_trained_on_a_fire_of_a_file(tmp_path):
+    write_asc(tmp_path / "fire.asc", raster_of(Ellipses(), 240))
+    fire = f"fire.path={tmp_path / 'fire.asc'}", "fire.units=minutes", "env.grid=[12,10]"
+    more = *TINY, "evaluation.scripted=[]", f"output={tmp_path / 'runs'}"
+    assert main(["train", "consensus", "setup=tuned", "world=file", *fire, *more]) == 0
+    (evaluated,) = tmp_path.glob("runs/*/eval.json")
+    assert set(json.loads(evaluated.read_text())["results"]) == {"file"}
+
+
 WORLDS = [world for world in known("world") if world != "file"]
 
 
