@@ -53,8 +53,6 @@ class CommModule(TensorDictModuleBase):
     hold: int = 1
     """steps from one decision of the policy to the next (`policy.hold`); between them, no policy
     reads observations"""
-    reserved: int = 0
-    """bytes of a learned message, which comes before what the module says at a decision"""
     maps: BeliefMaps | None
     """with `observation: map`, what each UAV knows: `forward` may enter what UAVs hear"""
 
@@ -154,13 +152,7 @@ class CommModule(TensorDictModuleBase):
 
         Negative for a UAV whose learned message does not fit, None without a limit.
         """
-        config = self.world.radio
-        if config.bandwidth is None:
-            return None
-        place, alive = tensordict.get(keys.POSITION), tensordict.get(keys.ALIVE)
-        left = radio.budget(config, radio.in_range(config, place, alive))
-        decides = tensordict.get(keys.STEP).unsqueeze(-1) % self.hold == 0
-        return None if left is None else left - self.reserved * decides
+        return tensordict.get(keys.BUDGET, None)
 
     @property
     def counts(self) -> bool:
@@ -199,7 +191,8 @@ class Communication(Transform):
         super().__init__()
         self.module, self.message_bytes, self._joined = module, message_bytes, False
         self.listens = module.hears or message_bytes > 0
-        module.reserved = message_bytes
+        limits = self.listens and module.world.radio.bandwidth is not None
+        self._writes = [keys.HEARS] * self.listens + [keys.BUDGET] * limits
         self.channel = radio.Channel(module.world, module.num_envs)
         for name, buffer in module.state_dict().items():
             if buffer.shape[:1] != (module.num_envs,):
@@ -264,8 +257,8 @@ class Communication(Transform):
             [steps, num_envs, ...].
         """
         self._listen(steps)
-        if self.listens:
-            last.set(keys.HEARS, steps.get(keys.HEARS)[-1])
+        for key in self._writes:
+            last.set(key, steps.get(key)[-1])
         last, bonus, sent = self.module.take_part(steps, last)
         changed = self._bytes(steps, sent)
         if bonus is not None:
@@ -292,14 +285,18 @@ class Communication(Transform):
         return heard.update(self._bytes(heard, sent))
 
     def _listen(self, steps: TensorDictBase) -> None:
-        """Writes the links of time steps, if the module or the policy reads them."""
+        """Writes the links and budgets of time steps, if the module or the policy reads them."""
         if self.listens:
-            at = (steps.get(key) for key in (keys.POSITION, keys.RNG_KEY, keys.STEP))
-            _, hears = self.channel(
-                *at, steps.get(keys.ALIVE) if self.module.world.failures else None
-            )
-            left = self.module.budget(steps) if self.message_bytes else None
-            steps.set(keys.HEARS, hears if left is None else hears & (left >= 0).unsqueeze(-2))
+            step, world = steps.get(keys.STEP), self.module.world
+            at = steps.get(keys.POSITION), steps.get(keys.RNG_KEY), step
+            near, hears = self.channel(*at, steps.get(keys.ALIVE) if world.failures else None)
+            left = radio.budget(world.radio, near)
+            if left is not None:
+                decides = step.unsqueeze(-1) % self.module.hold == 0
+                left = left - self.message_bytes * decides
+                steps.set(keys.BUDGET, left)
+                hears = hears & (left >= 0).unsqueeze(-2)
+            steps.set(keys.HEARS, hears)
 
     def _bytes(self, steps: TensorDictBase, sent: Tensor | None) -> dict[Any, Tensor]:
         """Returns the bytes that the UAVs send, in a world in which they are measured."""
@@ -342,6 +339,9 @@ class Communication(Transform):
         if self.listens:
             shape = torch.Size((*batch, uavs, uavs))
             spec[keys.HEARS] = Binary(shape=shape, device=spec.device, dtype=torch.bool)
+        if keys.BUDGET in self._writes:
+            shape = torch.Size((*batch, uavs))
+            spec[keys.BUDGET] = Unbounded(shape, device=spec.device, dtype=torch.int64)
         if self.module.world.measures == "all":
             shape = torch.Size((*batch, uavs))
             spec[keys.BYTES_SENT] = Unbounded(shape, device=spec.device, dtype=torch.int64)

@@ -23,9 +23,6 @@ _DIAGONAL = 2**0.5  # greatest distance over the ground that a unit of action le
 class MapsConfig:
     """Stores the settings under `comm`."""
 
-    acknowledge: bool = False
-    """whether UAVs know of each other only what they hear, and acknowledge messages; without it,
-    they do so only where the radio is late or limited"""
     home: bool = False
     """whether UAVs fly to a chain of radios to the base in time, whatever the policy does; without
     a base, and without a radio that reaches it, they do not"""
@@ -34,8 +31,9 @@ class MapsConfig:
 class Maps(CommModule):
     """Passes on the entries of the UAVs' belief maps.
 
-    At each step, a UAV sends the cells and the positions of UAVs that are new to a UAV in range;
-    received messages are passed on at the next step (`Exchange`).
+    At each step, a UAV sends the cells and the positions of UAVs that are new to a UAV in range, as
+    far as it has heard, and acknowledges messages; what it receives, it passes on at the next step
+    (`Exchange`).
 
     With `home` and a base, a UAV leaves for its place in a chain of radios from the base to the
     fire that it knows when it would otherwise come too late (`steer`).
@@ -67,8 +65,7 @@ class Maps(CommModule):
         self.area, later = area, world.radio.delay
         sizes = torch.full((area + world.num_uavs,), cell_bytes(world.horizon))
         sizes[area:] = 2 + step_bytes(world.horizon) + 12  # UAV, step, three float32 numbers
-        free = not (world.radio.packets or config.acknowledge)
-        self.messages = Exchange(world.radio, sizes, agents, unit=4, free=free)
+        self.messages = Exchange(world.radio, sizes, agents, unit=4)
         self.places = radio.Late(later, num_envs, torch.tensor(0.0), *agents[1:] * 2, 3)
         self.register_buffer("home", torch.zeros(*agents, 3, dtype=torch.float32))
         self.register_buffer("said", torch.zeros(agents, dtype=torch.int64))
@@ -104,12 +101,9 @@ class Maps(CommModule):
 
     def _talk(self, tensordict: TensorDictBase) -> None:
         """Exchanges messages between UAVs in range, and counts the bytes."""
-        maps, alive, step = self.maps, tensordict.get(keys.ALIVE), tensordict.get(keys.STEP)
+        maps, hears, step = self.maps, tensordict.get(keys.HEARS), tensordict.get(keys.STEP)
         self.messages.saw(maps.view)
-        near = radio.in_range(self.world.radio, tensordict.get(keys.POSITION), alive)
-        sent, _, new = self.messages(
-            maps.known, near, tensordict.get(keys.HEARS), step, self.budget(tensordict)
-        )
+        sent, _, new = self.messages(maps.known, hears, step, self.budget(tensordict))
         places = self.places(step, maps.place.clone())
         env, hearer, speaker, entry = new[:, new[3] >= self.area]
         uav = entry - self.area

@@ -44,6 +44,9 @@ OLD_CENTRE: Final = (AGENTS, "old_centre")
 HEARS: Final = (AGENTS, "hears")
 """bool [..., n]: the UAVs whose messages the UAV received at this step, False for itself. Written
 by communication."""
+BUDGET: Final = (AGENTS, "budget")
+"""int64 [...]: the bytes that the UAV can say at this step besides its learned message, negative if
+this does not fit. Written by communication with `radio.bandwidth`."""
 TARGET: Final = (AGENTS, "target")
 """float32 [..., 3]: the point that the UAV is told to fly to, cells. Written by communication."""
 FOLLOWS: Final = (AGENTS, "follows")

@@ -26,8 +26,7 @@ class Exchange(nn.Module):
 
     A radio knows of others what it hears: who was in range lately, what a radio has said, and which
     messages it has acknowledged. An acknowledgement is part of the next message, so that an entry
-    is said again `2 delay + 2` steps later if none has come. With `free`, radios know who is in
-    range and what they have, at no cost; nothing is late or limited.
+    is said again `2 delay + 2` steps later if none has come.
 
     Within a limit of bytes, the entries of the highest gain are said: the steps by which the looks
     of the radios in range get newer, at most `OLD` each.
@@ -40,7 +39,6 @@ class Exchange(nn.Module):
         shape: environments and radios.
         unit: numbers in a map per step.
         header: bytes that a radio says in each step, 2 of them its number.
-        free: see above.
     """
 
     pending: Tensor
@@ -74,22 +72,18 @@ class Exchange(nn.Module):
         *,
         unit: int = 1,
         header: int = 2,
-        free: bool = False,
     ):
         super().__init__()
-        self.config, self.unit, self.header, self.free = config, unit, header, free
+        self.config, self.unit, self.header = config, unit, header
         self.wait, items = 2 * config.delay + 2, len(sizes)
         (envs, radios), self.shape = shape, (*shape, items)
         self.register_buffer("sizes", sizes, persistent=False)
         self.register_buffer("_first", own_maps(*self.shape), persistent=False)
         self.register_buffer("pending", torch.zeros(self.shape, dtype=torch.bool))
         pairs = envs, radios, radios
-        self.register_buffer("contact", torch.zeros(pairs, dtype=torch.bool))
         waits = torch.zeros(pairs[:2], dtype=torch.int64)
         self.register_buffer("waits", waits, persistent=False)
-        if free:
-            return
-        for name in ("got", "acknowledged"):
+        for name in ("contact", "got", "acknowledged"):
             self.register_buffer(name, torch.zeros(pairs, dtype=torch.bool))
         self.register_buffer("heard", torch.full(pairs, -1))
         self.register_buffer("told_at", torch.full(self.shape, -1))
@@ -103,11 +97,9 @@ class Exchange(nn.Module):
 
     def start_episodes(self, mask: Tensor) -> None:
         """Forgets everything in the environments of a mask, bool [envs]."""
-        blank = {"pending": False, "contact": False}
-        if not self.free:
-            blank |= {"got": False, "acknowledged": False, "heard": -1}
-            blank |= {"told_at": -1, "told": _NOTHING, "has": _NOTHING}
-            self.links.sent[mask] = False
+        blank = {"pending": False, "contact": False, "got": False, "acknowledged": False}
+        blank |= {"heard": -1, "told_at": -1, "told": _NOTHING, "has": _NOTHING}
+        self.links.sent[mask] = False
         for name, value in blank.items():
             getattr(self, name)[mask] = value
 
@@ -116,14 +108,14 @@ class Exchange(nn.Module):
         mark(self.pending, view.cells + self._first[:, : view.cells.shape[1]], view.in_view)
 
     def forward(
-        self, known: Knowledge, near: Tensor, hears: Tensor, step: Tensor, left: Tensor | None
+        self, known: Knowledge, hears: Tensor, step: Tensor, left: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Speaks and listens for a step; updates the maps of the hearers.
 
         Args:
             known: the maps of all radios.
-            near, hears: bool [envs, r, r], the radios (column) in range of a radio, and those of
-                whose messages of this step none is lost.
+            hears: bool [envs, r, r], the radios (column) in range of a radio whose messages of this
+                step are not lost.
             step: int64 [envs], steps since the episode began.
             left: int64 [envs, r], the bytes that each radio can say; None for no limit.
 
@@ -132,14 +124,9 @@ class Exchange(nn.Module):
             each radio, bool [envs, r, r]; and which entries have changed by whose message, as
             (environment, hearer, speaker, entry), int64 [4, k].
         """
-        entry, code, spent = self._speak(known, near, step, left)
+        entry, code, spent = self._speak(known, step, left)
         size = self.sizes[entry % self.shape[2]]
         sent = spent.view(-1).index_add(0, entry // self.shape[2], size).view_as(spent)
-        if self.free:
-            # What all in range heard need not be said again.
-            missed = (self.contact & ~hears.mT).any(-1).view(-1)
-            self.pending.view(-1)[entry] = missed[entry // self.shape[2]]
-            return sent, hears, self._listen(known, entry, code, hears)
         now = hears & (sent > 0).unsqueeze(1)
         if self.config.delay:
             said = torch.zeros(self.shape, dtype=torch.bool, device=entry.device)
@@ -161,35 +148,29 @@ class Exchange(nn.Module):
         return (env * (slots - 1) + (step % slots)[env]) * a_step + entry
 
     def _speak(
-        self, known: Knowledge, near: Tensor, step: Tensor, left: Tensor | None
+        self, known: Knowledge, step: Tensor, left: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Returns the entries said and their codes, [k] each, and the bytes besides, [envs, r]."""
         radios, items = self.shape[1:]
-        heard = None if self.free else step.view(-1, 1, 1) - self.heard
-        contact = near.mT if heard is None else (heard < CONTACT) & (self.heard >= 0)
+        contact = (step.view(-1, 1, 1) - self.heard < CONTACT) & (self.heard >= 0)
         met = (contact & ~self.contact).any(-1)
         self.pending[met] = known.last_seen[met] >= 0
         self.contact.copy_(contact)
         entry = _marked(self.pending, contact.any(-1))
         row = entry // items
-        mine, theirs = codes(known, entry), self._theirs(known, entry)
-        spent = torch.zeros_like(near[..., 0], dtype=torch.int64)
-        waits = recent = told = None
-        if not self.free:
-            now = step[row // radios]
-            told, at = self.told.view(-1)[entry], self.told_at.view(-1)[entry]
-            back = self.acknowledged.flatten(0, 1)[row] & (at == now - self.wait).unsqueeze(-1)
-            theirs = torch.where(back, merged(theirs, told.unsqueeze(-1)), theirs)
-            self.has.view(-1, radios)[entry] = theirs
-            recent = (at >= 0) & (now - at < self.wait)
-            waits = recent & (told == mine)
-            spent, left = self._open(left)
+        mine, theirs = codes(known, entry), self.has.view(-1, radios)[entry]
+        now = step[row // radios]
+        told, at = self.told.view(-1)[entry], self.told_at.view(-1)[entry]
+        back = self.acknowledged.flatten(0, 1)[row] & (at == now - self.wait).unsqueeze(-1)
+        theirs = torch.where(back, merged(theirs, told.unsqueeze(-1)), theirs)
+        self.has.view(-1, radios)[entry] = theirs
+        recent = (at >= 0) & (now - at < self.wait)
+        spent, left = self._open(left)
         lacks = contact.flatten(0, 1)[row] & newer(mine.unsqueeze(-1), theirs)
         says = lacks.any(-1)
         self.pending.view(-1)[entry] = says
-        if waits is not None:
-            says = says & ~waits
-        if left is not None and recent is not None and told is not None:
+        says = says & ~(recent & (told == mine))
+        if left is not None:
             size, wanted = self.sizes[entry % items], says.clone()
             says &= size <= left.view(-1)[row]
             expected = torch.where(recent.unsqueeze(-1), merged(theirs, told.unsqueeze(-1)), theirs)
@@ -197,9 +178,8 @@ class Exchange(nn.Module):
             says[says.clone()] = self._fits(entry[says], gain, size[says], left.view(-1))
             self.waits.zero_().view(-1).index_add_(0, row, size * (wanted & ~says))
         entry, mine = entry[says], mine[says]
-        if not self.free:
-            self.told.view(-1)[entry] = mine
-            self.told_at.view(-1)[entry] = step[entry // items // radios]
+        self.told.view(-1)[entry] = mine
+        self.told_at.view(-1)[entry] = step[entry // items // radios]
         return entry, mine, spent
 
     def _open(self, left: Tensor | None) -> tuple[Tensor, Tensor | None]:
@@ -215,14 +195,6 @@ class Exchange(nn.Module):
             return spent, None
         speaks = left >= self.header
         return spent * speaks, (left - spent) * speaks
-
-    def _theirs(self, known: Knowledge, entry: Tensor) -> Tensor:
-        """Returns the codes that other radios have, as far as is known, int32 [k, r]."""
-        radios, items = self.shape[1:]
-        if not self.free:
-            return self.has.view(-1, radios)[entry]
-        first = entry // (radios * items) * radios * items + entry % items
-        return codes(known, first.unsqueeze(-1) + items * torch.arange(radios, device=entry.device))
 
     def _gain(self, mine: Tensor, theirs: Tensor) -> Tensor:
         """Returns the steps by which looks get newer, from step -1 where fire is news."""
@@ -253,21 +225,14 @@ class Exchange(nn.Module):
         env, speaker = row // radios, row % radios
         which, hearer = arrives.mT.flatten(0, 1)[row].nonzero(as_tuple=True)
         target = (env * radios * items + cell)[which] + hearer * items
-        link = (env * radios * radios + speaker)[which] + hearer * radios
         code, last, seen = code[which], known.last_seen, known.seen_fire
-        changed = told_again = newer(code, codes(known, target))
-        if self.free:
-            # Nor is an entry passed on if all radios in range of the hearer have heard it.
-            missed = ~arrives & ~torch.eye(radios, dtype=torch.bool, device=arrives.device)
-            relays = (self.contact.float() @ missed.float()) > 0  # [envs, hearers, speakers]
-            told_again = changed & relays.take(link)
-        self.pending.view(-1)[target[told_again]] = True
+        changed = newer(code, codes(known, target))
+        self.pending.view(-1)[target[changed]] = True
         assert seen is not None
         last.view(-1).scatter_reduce_(0, target, (code >> 1).to(last.dtype), "amax")
         mark(seen, target, (code & 1) > 0)
-        if not self.free:
-            at = target * radios + link % radios
-            self.has.view(-1)[at] = merged(self.has.view(-1)[at], code)
+        at = target * radios + speaker[which]
+        self.has.view(-1)[at] = merged(self.has.view(-1)[at], code)
         new = (changed & (code >> 1 == last.take(target))).nonzero().squeeze(-1)
         which = which[new]
         return torch.stack((env[which], hearer[new], speaker[which], cell[which]))
@@ -285,7 +250,8 @@ def share(
 
     Args:
         view: the cells in view.
-        near, hears, step: see `Exchange`.
+        near, hears: bool [envs, r, r], the links of a step without and with losses.
+        step: int64 [envs], steps since the episode began.
 
     Returns:
         The bytes that each radio says, int64 [envs, r]; None without an exchange.
@@ -295,7 +261,7 @@ def share(
         return None
     known.see(view, step.view(-1, 1, 1))
     exchange.saw(view)
-    sent, arrives, _ = exchange(known, near, hears, step, budget(exchange.config, near))
+    sent, arrives, _ = exchange(known, hears, step, budget(exchange.config, near))
     known.reach.copy_(arrives).diagonal(dim1=1, dim2=2).fill_(True)
     return sent
 

@@ -263,10 +263,10 @@ class Measures(nn.Module):
         if self.knowledge is None:
             return None, None, None
         told, known, said = [], [], []
-        for number, now in enumerate(step):
+        every = zip(*self.channel(position.double(), rng_key, step, alive), strict=True)
+        for number, (now, links) in enumerate(zip(step, every, strict=True)):
             looks = View(*(part[number] for part in view))
             flies = None if alive is None else alive[number]
-            links = self.channel(position[number].double(), rng_key, now, flies)
             gone = cell[row // envs == number]
             told.append(self._report(looks, now, links, ignited[number], gone, times))
             known.append(self.base_seen.clone())

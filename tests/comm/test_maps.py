@@ -139,20 +139,6 @@ def test_what_a_uav_sees_is_what_is_there():
     assert set(torch.stack(scene).unique().tolist()) == {0, 1, 2, 3}
 
 
-def test_lost_messages_are_counted_and_said_again():
-    """A UAV sees 25 cells at each step and leaves 5 behind; the other one hovers."""
-    position = torch.tensor([[[4.0, 4.0, 3.5], [20.0, 15.0, 3.5]]])
-    lossy = RadioConfig(range=60.0, loss=0.5)
-    env = environment(torch.full((1, 50, 20), torch.inf), position, radio=lossy)
-    ahead = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]).expand(40, 1, 2, 3)
-    lost, most = 0, 0
-    for td in fly(env, position, ahead)[1:]:
-        assert td[keys.BYTES_SENT].tolist() == [[16 + 5 * (25 + 5 * lost), 16 + 5 * 25]]
-        lost = 0 if td[keys.HEARS][0, 1, 0] else lost + 1
-        most = max(most, lost)
-    assert 1 < most < 40
-
-
 def test_environments_out_of_phase_have_pictures_of_their_own():
     """Pictures are drawn at decisions, which differ if one environment was reset between them."""
     fire = torch.cat([burning(seed, 20) for seed in range(2)])

@@ -12,7 +12,7 @@ from emberlink.envs.config import RadioConfig, WildfireConfig
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.world.coverage_map import View
-from emberlink.envs.world.exchange import Exchange
+from emberlink.envs.world.exchange import Exchange, cell_bytes
 from emberlink.envs.world.knowledge import Knowledge
 from emberlink.envs.world.radio import Channel, Late, budget
 
@@ -104,6 +104,11 @@ def test_what_is_late_arrives_as_it_was_sent_and_in_its_episode(delay, begins):
             assert arrives.tolist() == [[-1, -1] if then is None else [then, 2 * then]]
 
 
+@pytest.mark.parametrize(("horizon", "cell"), [(1000, 5), (65_535, 5), (65_536, 7)])
+def test_steps_above_65535_take_four_bytes(horizon, cell):
+    assert cell_bytes(horizon) == cell
+
+
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 999), unit=st.sampled_from([1, 4]), **RADIO)
 def test_messages_equal_plain_python_one_by_one(seed, unit, **radio):
@@ -125,7 +130,7 @@ def test_messages_equal_plain_python_one_by_one(seed, unit, **radio):
         position = draw(step // 9 + seed, ENVS, UAVS, 3).double() * 12
         near, hears = channel(position, keys, now)
         left = budget(config, near)
-        sent, arrives, _ = exchange(known, near, hears, now, left)
+        sent, arrives, _ = exchange(known, hears, now, left)
         for e, scalar in enumerate(scalars):
             for uav in range(UAVS):
                 seen = cells[e, uav][sees[e, uav]].tolist()
