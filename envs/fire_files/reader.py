@@ -17,12 +17,13 @@ from emberlink.envs.fire_files.files import TABLES, digest, find_format, quiet
 from emberlink.envs.fire_files.grid import on_grid
 from emberlink.envs.fire_files.perimeters import read_perimeters
 from emberlink.envs.fire_files.rasters import MAX_BANK, read_raster
-from emberlink.envs.fire_files.report import Report
+from emberlink.envs.fire_files.report import Report, ask
 from emberlink.envs.fire_files.tables import read_table
 from emberlink.envs.utils.atomic_io import open_regular, replaced, user_path
 from emberlink.envs.utils.errors import UserError, naming, printable
 
 READER_VERSION = 12  # increase it if the same file gives another grid
+_OF_TABLES = ("time_field", "time_format", "incident", "incident_field", "where", "radius")
 
 
 def read_with_summary(
@@ -35,8 +36,12 @@ def read_with_summary(
     report = Report()
     with _named(config.path, config.layer) as path, quiet():
         kind = find_format(path)
+        if kind in TABLES and (config.kind == "masks" or config.unburned is not None):
+            raise ask("fire.kind=masks and fire.unburned are for rasters", "none")
         if kind in TABLES:
             sources = [read_perimeters(read_table(path, kind, config), config, report)]
+        elif given := [key for key in _OF_TABLES if getattr(config, key) is not None]:
+            raise ask(f"fire.{given[0]} chooses among perimeters", "none for a raster")
         else:
             sources = read_raster(path, kind, config, horizon, report)
         try:

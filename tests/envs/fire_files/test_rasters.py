@@ -213,7 +213,7 @@ def test_no_arrival_is_lost(rows, columns, side, x, y, seed):
     random = np.random.default_rng(seed)
     times = random.uniform(0, 100, (rows, columns))
     times[random.random(times.shape) < 0.3] = INF
-    times[0, 0] = 5.0
+    times[0, 0], times[-1, -1] = 5.0, 60.0
     window, last = Window(x, y, side, (8, 9)), times[times < INF].max()
     for plane in (Plane(""), None):  # None: a map of the whole grid
         fire = as_fire(times, Clock("minutes"), plane)
