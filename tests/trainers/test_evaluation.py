@@ -7,6 +7,7 @@ import os
 
 import pytest
 import torch
+from rich.table import Column, Table
 
 from emberlink.envs import keys, metrics
 from emberlink.envs.fire.generator import fire_seeds, load_scenario, make_fires
@@ -175,6 +176,17 @@ def test_narrow_tables_keep_every_number(columns, monkeypatch, capsys):
     for name, (number, _) in measured.items():
         shown = f"{number:.{scores.DIGITS.get(name, 1)}f}"
         assert words.count(shown) == 1 + len(POLICIES)
+
+
+def test_words_make_room_for_numbers(monkeypatch, capsys):
+    table = Table("measure", "policy", Column("interval", justify="right"))
+    table.add_row("time_to_coverage of", "random waypoints", "[1000.0, 1000.0]")
+    for columns in range(48, 70):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        SafeConsole().print(table)
+        lines = capsys.readouterr().out.splitlines()
+        assert max(map(len, lines)) <= columns
+        assert "[1000.0, 1000.0]" in " ".join(lines)
 
 
 def test_validation_has_fires_and_starts_of_its_own(cache, monkeypatch):

@@ -51,18 +51,22 @@ class SafeConsole(Console):
             words = (cell.split("\n" if column.no_wrap else None) for cell in cells)
             column.min_width = max((len(word) for cell in words for word in cell), default=0)
             column.overflow = "fold"
-        parts = [copy(table)]
+        wide, parts = self.options.update(width=10_000), [copy(table)]
         parts[0].columns = [first]
         for column in others:
             wider = copy(parts[-1])
             wider.columns = [*wider.columns, column]
-            narrowest = self.measure(wider, options=self.options.update(width=10_000)).minimum
+            narrowest = self.measure(wider, options=wide).minimum
             if narrowest > self.width and len(parts[-1].columns) > 1:
                 parts[-1].caption = wider.title = None
                 wider.columns = [first, column]
                 parts.append(wider)
             else:
                 parts[-1] = wider
+        for part in parts:  # rich may narrow a column below its words, and then cut another
+            for column in part.columns:
+                if self.measure(part, options=wide).maximum > self.width and not column.no_wrap:
+                    column.max_width = column.min_width
         return parts
 
     def render(
