@@ -272,14 +272,3 @@ def test_a_missing_package_is_an_error_before_training(monkeypatch, capsys):
     said = "logger=tensorboard: tensorboard is not installed: pip install"
     refused(["train", "independent", *ARGUMENTS, "logger=tensorboard"], capsys, said)
     assert not Path("runs").exists()
-
-
-@pytest.mark.slow
-def test_wandb_cannot_reach_its_server(tmp_path, monkeypatch):
-    """No server listens at port 9 of the local machine, and the key is invalid."""
-    monkeypatch.setenv("WANDB_MODE", "online")
-    monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")
-    monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
-    monkeypatch.setattr(tracking, "_CONNECTING", 1.0)
-    monkeypatch.setattr(tracking, "_PATIENCE", 1.0)
-    assert len(train("wandb", tmp_path)) == 1

@@ -101,14 +101,12 @@ def test_cut_and_overwritten_files(wholes, tmp_path):
 
 def test_no_regular_files_and_no_addresses(tmp_path, wholes):
     os.mkfifo(tmp_path / "pipe.tif")
-    (tmp_path / "loop.shp").symlink_to(tmp_path / "loop.shp")
     (tmp_path / "empty").mkdir()
     with (tmp_path / "large.geojson").open("wb") as file:
         file.write(b"{")
         file.truncate(150_000_001)  # a hole, which takes no space
     for name, match in {
         "pipe.tif": "no regular file",
-        "loop.shp": "cannot be read|no such file",
         "none.gpkg": "no such file",
         "empty": "a folder with 0 files of perimeters",
         "large.geojson": "150000001 bytes; .* at most 150000000",
@@ -141,7 +139,6 @@ def test_links_declarations_and_sizes_in_texts_are_refused(tmp_path, wholes):
     for name, text, match in (
         ("fire.asc", rows.replace("NCOLS 40", "NCOLS 1000000000"), "40 x 1000000000|expected"),
         ("fire.json", json.dumps({**whole, "crs": link}), "crs is a link, which is not followed"),
-        ("fire.json", '{"a":' * 100_000, "levels|recursion|expected"),
         ("fire.kml", f'<!DOCTYPE kml [<!ENTITY a "aaaa">]>{kml}', "document type declaration"),
     ):
         (tmp_path / name).write_text(text)
