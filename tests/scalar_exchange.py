@@ -25,6 +25,9 @@ class ScalarExchange:
         self.known = [{} for _ in everyone]
         self.has = [[{} for _ in everyone] for _ in everyone]
         self.told = [{} for _ in everyone]  # entry -> (look, step)
+        self.pending: list[set] = [set() for _ in everyone]
+        self.contact: list[list] = [[] for _ in everyone]
+        self.reached = [[{} for _ in everyone] for _ in everyone]  # hearer, speaker: radio -> step
         self.heard = [{} for _ in everyone]  # radio -> step
         self.got = [[] for _ in everyone]
         self.acknowledged = [[] for _ in everyone]
@@ -33,6 +36,10 @@ class ScalarExchange:
         self.waits = [0] * radios
 
     def see(self, radio: int, looks: dict) -> None:
+        self.pending[radio] |= set(looks)
+        self._enter(radio, looks)
+
+    def _enter(self, radio: int, looks: dict) -> None:
         for entry, look in looks.items():
             self.known[radio][entry] = joined(look, self.known[radio].get(entry, NOTHING))
 
@@ -43,16 +50,24 @@ class ScalarExchange:
         self.flying = [m for m in self.flying if m[0] > step]
         self.got = [[] for _ in self.everyone]
         self.acknowledged = [[] for _ in self.everyone]
+        heard = []
         for _, speaker, hearer, looks, acks in arriving:
             self.arrived += 1
             self.got[hearer].append(speaker)
             self.heard[hearer][speaker] = step
             if hearer in acks:
                 self.acknowledged[hearer].append(speaker)
+            self.reached[hearer][speaker] |= dict.fromkeys(acks, step)
             theirs = self.has[hearer][speaker]
             for entry, look in looks.items():
                 theirs[entry] = joined(look, theirs.get(entry, NOTHING))
-            self.see(hearer, looks)
+            new = {e for e, x in looks.items() if lacks(x, self.known[hearer].get(e, NOTHING))}
+            heard.append((hearer, speaker, looks, new))
+        for hearer, speaker, looks, new in heard:
+            reached = {j for j, at in self.reached[hearer][speaker].items() if step - at < 10}
+            if set(self.contact[hearer]) - reached - {speaker}:
+                self.pending[hearer] |= new
+            self._enter(hearer, looks)
         return spent, [[j in self.got[i] for j in self.everyone] for i in self.everyone]
 
     def _speak(self, i: int, step: int, left, near, hears) -> int:
@@ -96,8 +111,12 @@ class ScalarExchange:
     def _offers(self, i: int, step: int) -> list:
         """Returns the entries that radios in range may lack, with their sort keys."""
         told, contact = self.told[i], [j for j, at in self.heard[i].items() if step - at < 10]
+        if set(contact) - set(self.contact[i]):
+            self.pending[i] = set(self.known[i])
+        self.contact[i] = contact
         offered = []
-        for entry, look in self.known[i].items():
+        for entry in sorted(self.pending[i]) if contact else []:
+            look = self.known[i][entry]
             last, when = told.get(entry, (NOTHING, -1))
             recent = when >= 0 and step - when < self.wait
             gain, wanted = 0, False
@@ -108,6 +127,7 @@ class ScalarExchange:
                     theirs = joined(theirs, last) if recent else theirs
                     before = -1 if look[1] and not theirs[1] else theirs[0] // self.unit
                     gain += min(100, max(0, look[0] // self.unit - before))
+            self.pending[i] -= set() if wanted else {entry}
             if wanted and not (recent and last == look):
                 items = len(self.sizes)
                 turned = (entry + i * (items // len(self.known))) % items

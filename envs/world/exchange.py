@@ -24,6 +24,10 @@ class Exchange(nn.Module):
     A radio says an entry if a radio in range has no look at it, has an older one, or does not know
     that it was seen while it burned. What it receives, it passes on from the next step on.
 
+    An entry that it has heard is left to the speaker, unless it is in contact with a radio whose
+    messages the speaker is not known to have acknowledged lately: else each radio of a clique would
+    tell all others what one has told.
+
     A radio knows of others what it hears: who was in range lately, what a radio has said, and which
     messages it has acknowledged. An acknowledgement is part of the next message, so that an entry
     is said again `2 delay + 2` steps later if none has come.
@@ -55,6 +59,9 @@ class Exchange(nn.Module):
     """int64 [envs, r, r]: step of the last message that a radio (row) received, -1 for none"""
     got: Tensor
     """bool [envs, r, r]: the messages that a radio (row) received at the last step"""
+    reached: Tensor
+    """int64 [envs, r, r, r]: step at which a radio (second) last heard another one (third)
+    acknowledge a message of one (last), -1 for never"""
     codes: Tensor
     """int32 [envs, delay + 1, r, items]: the codes in flight of the entries said at a step"""
     acknowledged: Tensor
@@ -86,6 +93,7 @@ class Exchange(nn.Module):
         for name in ("contact", "got", "acknowledged"):
             self.register_buffer(name, torch.zeros(pairs, dtype=torch.bool))
         self.register_buffer("heard", torch.full(pairs, -1))
+        self.register_buffer("reached", torch.full((*pairs, radios), -1))
         self.register_buffer("told_at", torch.full(self.shape, -1))
         nothing = torch.tensor(_NOTHING, dtype=torch.int32)
         self.register_buffer("told", nothing.repeat(self.shape))
@@ -98,7 +106,7 @@ class Exchange(nn.Module):
     def start_episodes(self, mask: Tensor) -> None:
         """Forgets everything in the environments of a mask, bool [envs]."""
         blank = {"pending": False, "contact": False, "got": False, "acknowledged": False}
-        blank |= {"heard": -1, "told_at": -1, "told": _NOTHING, "has": _NOTHING}
+        blank |= {"heard": -1, "reached": -1, "told_at": -1, "told": _NOTHING, "has": _NOTHING}
         self.links.sent[mask] = False
         for name, value in blank.items():
             getattr(self, name)[mask] = value
@@ -136,10 +144,16 @@ class Exchange(nn.Module):
             entry = _marked(said, torch.ones_like(said[..., 0]))
             code = self.codes.view(-1)[self._in_flight(entry, step - self.config.delay)]
         arrives = self.links(step, now)
-        self.acknowledged.copy_(arrives & self.acks(step, self.got).mT)
+        acks = self.acks(step, self.got)
+        self.acknowledged.copy_(arrives & acks.mT)
+        told = arrives.unsqueeze(-1) & acks.unsqueeze(1)
+        self.reached.copy_(torch.where(told, step.view(-1, 1, 1, 1), self.reached))
         self.got.copy_(arrives)
         self.heard.copy_(torch.where(arrives, step.view(-1, 1, 1), self.heard))
-        return sent, arrives, self._listen(known, entry, code, arrives)
+        reaches = (self.reached >= 0) & (step.view(-1, 1, 1, 1) - self.reached < CONTACT)
+        reaches |= torch.eye(self.shape[1], dtype=torch.bool, device=entry.device)
+        passes = (self.contact.unsqueeze(2) & ~reaches).any(-1)
+        return sent, arrives, self._listen(known, entry, code, arrives, passes)
 
     def _in_flight(self, entry: Tensor, step: Tensor) -> Tensor:
         """Returns the indices into the flat `codes` of entries said at steps, int64 [envs]."""
@@ -218,8 +232,13 @@ class Exchange(nn.Module):
         fits[order] = total - before[row] <= left[row]
         return fits
 
-    def _listen(self, known: Knowledge, entry: Tensor, code: Tensor, arrives: Tensor) -> Tensor:
-        """Enters what arrives into the maps; returns the changes, see `forward`."""
+    def _listen(
+        self, known: Knowledge, entry: Tensor, code: Tensor, arrives: Tensor, passes: Tensor
+    ) -> Tensor:
+        """Enters what arrives into the maps; returns the changes, see `forward`.
+
+        `passes`, bool [envs, r, r]: a radio passes on what it hears from another one (column).
+        """
         radios, items = self.shape[1:]
         row, cell = entry // items, entry % items
         env, speaker = row // radios, row % radios
@@ -227,7 +246,7 @@ class Exchange(nn.Module):
         target = (env * radios * items + cell)[which] + hearer * items
         code, last, seen = code[which], known.last_seen, known.seen_fire
         changed = newer(code, codes(known, target))
-        self.pending.view(-1)[target[changed]] = True
+        self.pending.view(-1)[target[changed & passes[env[which], hearer, speaker[which]]]] = True
         assert seen is not None
         last.view(-1).scatter_reduce_(0, target, (code >> 1).to(last.dtype), "amax")
         mark(seen, target, (code & 1) > 0)

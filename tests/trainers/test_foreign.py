@@ -156,7 +156,6 @@ def test_a_dictionary_where_an_observation_has_several_tensors():
         ("mine.py:fails", r"mine: ValueError: no fuel \(.*mine.py:13\)"),
         ("mine.py:shrinks", r"mine: .*\[3, 3\]; expected \[50, 3, 3\]"),
         ("mine.py:rises", "known: rise, turn"),
-        ("no.py:rise", "no.py:rise: FileNotFoundError"),
     ],
 )
 def test_a_policy_that_fails_is_one_line_with_its_name(source, name, message):

@@ -131,13 +131,11 @@ def test_import_of_several_files(capsys, tmp_path):
         (["preview", "bank.npy:2"], ["bank.npy", "no fire '2'", "0 to 1"]),
         (["preview", "paper", "--output", "there.png"], ["there.png exists already"]),
         (["import", "300.npy", "--output", "bank.npy"], ["bank.npy exists already"]),
-        (["import", "300.npy", "--output", "beside.npy"], ["beside.json exists already"]),
         (["import", "300.npy", "env.horizon=9", "--output", "a.npy"], ["300", "fire.end=300"]),
     ],
 )
 def test_errors_are_one_line_and_leave_no_files(arguments, words, capsys, tmp_path):
     (tmp_path / "there.png").write_text("mine")
-    (tmp_path / "beside.json").write_text("mine")
     fires = make_fires(HUYGENS, fire_seeds("train", 2), (30, 30), 300)
     np.save(tmp_path / "bank.npy", fires.numpy())
     np.save(tmp_path / "300.npy", fires.numpy())

@@ -95,15 +95,6 @@ def test_a_configuration(kind, run, mark, capsys):
     assert "config.yaml" in harmless(["train", f"resume={run}"], capsys, mark)
 
 
-@pytest.mark.parametrize("text", ["[1]\n", "[" * 100_000 + "\n", "\x00\x01\n"])
-def test_json_of_a_run(text, run, mark, capsys, tmp_path):
-    for file, command in (("metrics.jsonl", "eval"), ("eval.json", "compare")):
-        before = (run / file).read_text()
-        (run / file).write_text(text)
-        assert str(run / file) in harmless([command, run], capsys, mark)
-        (run / file).write_text(before)
-
-
 @pytest.mark.parametrize(
     ("name", "kind"),
     [

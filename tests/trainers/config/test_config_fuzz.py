@@ -8,9 +8,7 @@ import functools
 import math
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
@@ -20,7 +18,7 @@ from robustness import SOAK
 from emberlink.comm.base import MODULES
 from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.compose import flat, from_values, resolve, to_values
+from emberlink.trainers.config.compose import from_values, resolve, to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.ddpg import DDPGConfig
 from emberlink.trainers.training.setup import TrainingSetup
@@ -256,10 +254,3 @@ def test_an_invalid_value_gives_one_line_that_names_the_key(chosen, key, schema)
     del at[last]
     if "default" not in schema:
         refused(key, lambda: from_values(without))
-
-
-def test_numpys_numbers_are_numbers_and_paths_are_text():
-    given = {"learner.hidden": np.arange(1, 4), "learner.gamma": np.float64(0.5)}
-    values = flat(to_values(resolve("consensus", output=Path("my/runs"), **given)))
-    found = values["learner.hidden"], values["learner.gamma"], values["output"]
-    assert found == ([1, 2, 3], 0.5, "my/runs")
