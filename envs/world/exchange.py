@@ -150,7 +150,7 @@ class Exchange(nn.Module):
         self.reached.copy_(torch.where(told, step.view(-1, 1, 1, 1), self.reached))
         self.got.copy_(arrives)
         self.heard.copy_(torch.where(arrives, step.view(-1, 1, 1), self.heard))
-        reaches = (self.reached >= 0) & (step.view(-1, 1, 1, 1) - self.reached < CONTACT)
+        reaches = _lately(self.reached, step.view(-1, 1, 1, 1))
         reaches |= torch.eye(self.shape[1], dtype=torch.bool, device=entry.device)
         passes = (self.contact.unsqueeze(2) & ~reaches).any(-1)
         return sent, arrives, self._listen(known, entry, code, arrives, passes)
@@ -166,7 +166,7 @@ class Exchange(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Returns the entries said and their codes, [k] each, and the bytes besides, [envs, r]."""
         radios, items = self.shape[1:]
-        contact = (step.view(-1, 1, 1) - self.heard < CONTACT) & (self.heard >= 0)
+        contact = _lately(self.heard, step.view(-1, 1, 1))
         met = (contact & ~self.contact).any(-1)
         self.pending[met] = known.last_seen[met] >= 0
         self.contact.copy_(contact)
@@ -237,7 +237,7 @@ class Exchange(nn.Module):
     ) -> Tensor:
         """Enters what arrives into the maps; returns the changes, see `forward`.
 
-        `passes`, bool [envs, r, r]: a radio passes on what it hears from another one (column).
+        `passes`, bool [envs, r, r]: whether a radio passes on the entries of another one (column).
         """
         radios, items = self.shape[1:]
         row, cell = entry // items, entry % items
@@ -255,6 +255,11 @@ class Exchange(nn.Module):
         new = (changed & (code >> 1 == last.take(target))).nonzero().squeeze(-1)
         which = which[new]
         return torch.stack((env[which], hearer[new], speaker[which], cell[which]))
+
+
+def _lately(at: Tensor, step: Tensor) -> Tensor:
+    """Returns which steps, -1 for never, are among the last `CONTACT`."""
+    return (at >= 0) & (step - at < CONTACT)
 
 
 def share(

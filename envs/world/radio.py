@@ -29,7 +29,7 @@ class Channel(nn.Module):
     Args:
         world: the environment's constants.
         envs: number of environments.
-        base: whether the base is a radio, too.
+        base: whether the base has a radio.
     """
 
     bad: Tensor
@@ -113,7 +113,7 @@ class Channel(nn.Module):
 
 
 class Late(nn.Module):
-    """Keeps what was sent at the last steps, `delay` and the present one, until it arrives.
+    """Keeps the messages of the last `delay` steps and of the present one until they arrive.
 
     Args:
         delay: steps from sending to receiving.

@@ -93,16 +93,12 @@ class TrainingSetup:
         copy_into(flatten(self.collector.carried), carried)
         restored = unflatten(carried, 1, device)
         self.collector.restore(restored, step // self.config.policy.hold)  # resets the environments
-        self.load_learner(state)
+        weights = prefixed(weights=group(state, "weights"))
+        self.learner.load_state_dict(group(state, "learner") | weights)
         copy_into(self.env.base_env.state_dict(), group(state, "environments"))
         copy_into(self.env.transform.state_dict(), group(state, "communication"))
         self.record.load_state_dict(group(state, "episode"), device)
         self.step = step
-
-    def load_learner(self, state: Mapping[str, Tensor]) -> None:
-        """Restores the learner from a state of `state_dict`."""
-        weights = prefixed(weights=group(state, "weights"))
-        self.learner.load_state_dict(group(state, "learner") | weights)
 
 
 def check_setup(config: RunConfig) -> None:

@@ -67,7 +67,7 @@ class Trainer:
     def start(self) -> RunFolder:
         """Creates the run folder, locks it and returns it."""
         warm_start.start(self.setup.learner, self.config)  # before there are files
-        self.setup.load_learner(self.setup.state_dict())  # else only a resume tells that it fails
+        self.setup.learner.load_state_dict(self.setup.learner.state_dict())  # as a resume does
         run = RunFolder.create(self.config)
         self.open(run, Lock(run.path))
         return run
@@ -140,8 +140,8 @@ class Trainer:
         config, run = self.config, self.run
         policy = TrainedPolicy(self.setup.actor, config, run.checkpoint())
         results = evaluate_run(run, policy, report=report)
-        figures = sorted((run.path / "figures").glob("*.[pg][ni][gf]"))
-        self.tracker.log_evaluation(learned_means(results), figures)
+        pictures = [p for p in sorted(run.figures().iterdir()) if p.suffix in (".png", ".gif")]
+        self.tracker.log_evaluation(learned_means(results), pictures)
         return results
 
     def save(self) -> None:
