@@ -71,13 +71,15 @@ class PictureEncoder(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps uint8 [groups, rows, pictures, channels, S, S] to [groups, rows, features]."""
-        groups, encoded = len(x), []
+        groups, encoded, kind = len(x), [], x.device.type
+        half = torch.is_autocast_enabled(kind)
+        dtype = torch.get_autocast_dtype(kind) if half else torch.float32
         pictures: Any = self.pictures
         for layers, picture in zip(pictures, x.unbind(2), strict=True):
             # Bytes with the channels last: the convolutions are then a quarter faster on a CPU. A
             # picture of floats is copied, as it is the caller's.
             y = picture.transpose(0, 1).flatten(1, 2).contiguous(memory_format=torch.channels_last)
-            y = y.to(layers[0].weight.dtype, copy=True).div_(255)
+            y = y.to(dtype, copy=True).div_(255)
             for layer in layers:
                 y = layer(y).relu_()
             encoded.append(y.unflatten(1, (groups, -1)).transpose(0, 1).flatten(2))

@@ -175,6 +175,11 @@ class Learner(ABC):
             generator=generator,
         )
 
+    def precision(self) -> torch.autocast:
+        """Returns the context of a loss, for learners with the setting `bfloat16`."""
+        device = torch.device(self.context.device).type
+        return torch.autocast(device, torch.bfloat16, enabled=self.config.bfloat16)
+
     @abstractmethod
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
         """Learns from a rollout, batch size [num_envs, rollout_steps].

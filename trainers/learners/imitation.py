@@ -42,6 +42,8 @@ class ImitationConfig(LearnerConfig):
     """share of decisions that the teacher takes at the beginning; it falls linearly to 0"""
     lr: Positive
     """learning rate of Adam at the beginning; it falls linearly to 0 at the end of the run"""
+    bfloat16: bool = False
+    """whether updates compute with numbers of 16 bits where these suffice (`torch.autocast`)"""
     updates_per_step: Count
     """updates per decision of the batch of environments"""
     samples: Count
@@ -156,7 +158,8 @@ class Imitation(Learner):
 
     def update(self, batch: TensorDictBase) -> Losses:
         """Performs one step of the optimizer on rows of the replay buffer, [batch, uavs]."""
-        losses = self.losses(batch)
+        with self.precision():
+            losses = self.losses(batch)
         networks = 1 if self.config.share_parameters else self.context.num_uavs
         losses["imitation"].unflatten(0, (networks, -1)).mean(1).sum().backward()
         self.optimizer.step()

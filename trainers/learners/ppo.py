@@ -77,6 +77,8 @@ class IPPOConfig(LearnerConfig):
     """learning rate of Adam at the beginning; it falls linearly to 0 at the end of the run"""
     gradient_norm: Positive
     """largest Euclidean norm of the gradient of a network"""
+    bfloat16: bool = False
+    """whether updates compute with numbers of 16 bits where these suffice (`torch.autocast`)"""
     entropy: NotNegative
     """weight of the entropy of the actions in the actors' loss"""
     log_std: Annotated[float, Field(ge=-10, le=2)] = -0.5
@@ -94,7 +96,8 @@ class MAPPOConfig(IPPOConfig):
     """Stores the settings of MAPPO."""
 
     critic_map: bool = False
-    """whether the critic, in training, also reads the true map: burning cells, seen and not seen"""
+    """whether the critic, in training, reads the true map of burning cells, seen and not seen, instead
+    of the UAVs' windows and pictures"""
 
     @property
     def reads_map(self) -> bool:
@@ -346,7 +349,8 @@ class PPO(Learner, ABC):
 
     def update(self, batch: TensorDictBase) -> Losses:
         """Performs one step of the optimizer on chunks."""
-        losses = self.losses(batch)
+        with self.precision():
+            losses = self.losses(batch)
         torch.stack([self._of_networks(*item) for item in losses.items()]).sum().backward()
         for part in self.parts:
             gradients = [value.grad for value in part if value.grad is not None]
@@ -405,17 +409,21 @@ class IPPO(PPO):
 class MAPPO(PPO):
     """Values the observations and positions of the whole team, with one number for each UAV.
 
-    With `critic_map`, it also reads the true map, which no actor does. The critic has one set of
-    weights and is used in training alone.
+    With `critic_map`, it reads the true map, which no actor does, instead of windows and pictures.
+    The critic has one set of weights and is used in training alone.
     """
 
     config_type = MAPPOConfig
 
     def make_critic(self, context: LearnerContext, generator: torch.Generator) -> TensorDictModule:
         spec, world = context.observation_spec, context.world
+        observed: list[Any] = keys.observation_keys(spec)
+        shapes = keys.observation_shapes(spec)
+        if self.config.critic_map:  # the vectors, which come first
+            observed, shapes = [observed[0], keys.TRUE_MAP], shapes[:1]
         network = TeamNetwork(
             context.num_uavs,
-            keys.observation_shapes(spec),
+            shapes,
             world.low,
             world.high,
             hidden=self.config.hidden,
@@ -425,9 +433,8 @@ class MAPPO(PPO):
             device=context.device,
             generator=generator,
         )
-        observed: list[Any] = [keys.POSITION, *keys.observation_keys(spec)]
-        observed += [keys.TRUE_MAP] if self.config.critic_map else []
-        return TensorDictModule(network, in_keys=[CRITIC_STATE, *observed], out_keys=[VALUE, "_"])
+        reads: list[Any] = [CRITIC_STATE, keys.POSITION, *observed]
+        return TensorDictModule(network, in_keys=reads, out_keys=[VALUE, "_"])
 
 
 def clip_by_row(gradients: Sequence[Tensor], limit: float) -> None:

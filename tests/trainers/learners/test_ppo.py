@@ -179,6 +179,25 @@ def test_only_mappos_critic_reads_the_true_map():
     assert not any(one.isclose(other).any() for one, other in combinations(values, 2))
 
 
+def test_a_critic_of_the_true_map_reads_no_pictures():
+    learner: Any = made("mappo", "learner.critic_map=true", method="maps").learner
+    assert keys.CROPS in learner.actor.in_keys
+    assert keys.CROPS not in learner.critic.in_keys
+
+
+def test_updates_with_16_bits_have_nearly_the_losses_of_32():
+    batch = first_batches(made("mappo", method="maps"))[0]
+    (full, exact), (half, near) = (
+        (setup.learner, setup.learner.update(batch.clone()))
+        for setup in (made("mappo", f"learner.bfloat16={x}", method="maps") for x in (False, True))
+    )
+    assert not exact["critic"].equal(near["critic"])
+    for name in ("actor", "critic"):
+        torch.testing.assert_close(exact[name], near[name], rtol=0.05, atol=0.01)
+    assert {x.dtype for x in half.loss.parameters()} == {torch.float32}
+    assert full.loss.state_dict().keys() == half.loss.state_dict().keys()
+
+
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_the_losses_are_those_of_ppo(learner):
     setup = made(learner, "learner.clip=0.1", "learner.entropy=0.01")
