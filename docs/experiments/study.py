@@ -17,16 +17,22 @@ NEW = ["evaluation.huygens=false", "fire.test_seed=1500000"]
 WORLDS = {"front": [], "relay": ["env.reward.base=1.0"], "paper": NEW, "swarm": []}
 ALL = ["setup=strong", "env.reward.unseen=-0.03", "evaluation.scripted=[]"]
 OF_SWEEP = ["executor.workers=1", "executor.threads=1"]
-OF_VECTOR = ["learner.chunk=25", "episodes=240", "evaluation.interval=10"]
+OF_VECTOR = [
+    *("learner.chunk=25", "learner.critic_map=true"),
+    *("episodes=240", "evaluation.interval=15"),
+]
 OF_PICTURES = ["env.observation=map", "policy.memory=none", "learner.hidden=[64]"]
 OF_IMITATION = [
     *("learner=imitation", "learner.updates_per_step=4", "learner.buffer_size=50000"),
-    *("learner.lr=1e-3", "num_envs=16", "episodes=8"),
+    *("learner.lr=1e-3", "learner.bfloat16=true", "num_envs=16", "episodes=8"),
     *("evaluation.interval=8", "evaluation.episodes=1"),
 ]
+TEACHER = {"relay": ["learner.teacher=shuttle"]}
+"""in other worlds `map_greedy` is imitated"""
 OF_MAP = [
-    *("learner.gamma=0.95", "learner.gae_lambda=0.95", "learner.epochs=2", "learner.lr=5e-4"),
-    *("learner.log_std=-1.2", "num_envs=32", "episodes=60", "evaluation.interval=4"),
+    *("learner.critic_map=true", "learner.bfloat16=true", "learner.log_std=-1.2"),
+    *("learner.gamma=0.95", "learner.gae_lambda=0.95", "learner.epochs=1", "learner.lr=1e-3"),
+    *("num_envs=32", "episodes=80", "evaluation.interval=5"),
 ]
 ATTENTION = "policy.message=attention"
 EXCHANGES: dict[str, tuple[str, Sequence[str]]] = {
@@ -75,7 +81,8 @@ def commands(output: Path, world: str, observed: str, name: str) -> Iterator[lis
         more = [f"seed={seed}", *OF_SWEEP]
         if observed == "map":
             first = output / world / f"imitation_{name}"
-            yield ["sweep", *common, *OF_IMITATION, *more, f"output={first}"]
+            taught = [*OF_IMITATION, *TEACHER.get(world, [])]
+            yield ["sweep", *common, *taught, *more, f"output={first}"]
             more.append(f"learner.warm_start={_run(first, seed)}")
         yield ["sweep", *trained, *more, f"output={folder}"]
         for fault in ("zero", "shuffle") if "message" in str(common) else ():
