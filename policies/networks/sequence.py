@@ -18,7 +18,9 @@ FIRST_LOG_STD = -0.5
 """initial logarithm of the standard deviation of the actions"""
 
 FIRE = (1, 2)
-"""cells of the true map that a critic reads, each kind as a channel: seen and unseen fire"""
+"""cells of the true map that a critic reads, the share of each kind: seen and unseen fire"""
+COARSE = 10
+"""largest number of squares along a side of the map in which a critic reads these shares"""
 
 
 class SequenceNetwork(nn.Module):
@@ -215,9 +217,12 @@ class TeamNetwork(nn.Module):
     ):
         super().__init__()
         first, *windows = observations
-        shapes = [(uavs * (first[0] + 3),), *((uavs * n, *sides) for n, *sides in windows)]
-        shapes += [] if grid is None else [(len(FIRE), *grid)]
-        self.network, self.grid = SequenceNetwork(1, shapes, uavs, **more), grid
+        self.square = 0 if grid is None else -(-max(grid) // COARSE)
+        """cells along a side of a square of the map"""
+        coarse = math.prod(-(-side // self.square) for side in grid) if grid else 0
+        features = uavs * (first[0] + 3) + len(FIRE) * coarse
+        shapes = [(features,), *((uavs * n, *sides) for n, *sides in windows)]
+        self.network = SequenceNetwork(1, shapes, uavs, **more)
         corners = torch.tensor([low, high], dtype=torch.float32, device=more.get("device"))
         self.register_buffer("middle", corners.mean(0), persistent=False)
         self.register_buffer("half_width", (corners[1] - corners[0]) / 2 + 1e-6, persistent=False)
@@ -238,11 +243,12 @@ class TeamNetwork(nn.Module):
         Returns:
             Outputs, [rows, decisions, uavs, 1], and the state after the last decision.
         """
-        observations = inputs if self.grid is None else inputs[:-1]
-        first, *windows = observations
-        vectors = torch.cat((first, (position - self.middle) / self.half_width), -1)
-        team = [vectors.flatten(2), *(x.flatten(2, 3) for x in windows)]
-        if self.grid is not None:
-            team.append(torch.stack([inputs[-1] == kind for kind in FIRE], 2))
+        first, *windows = inputs[:-1] if self.square else inputs
+        vectors = torch.cat((first, (position - self.middle) / self.half_width), -1).flatten(2)
+        if self.square:
+            fire = torch.stack([inputs[-1] == kind for kind in FIRE], 2).flatten(0, 1).float()
+            fire = nn.functional.avg_pool2d(fire, self.square, ceil_mode=True)
+            vectors = torch.cat((vectors, fire.view(*vectors.shape[:2], -1)), -1)
+        team = [vectors, *(x.flatten(2, 3) for x in windows)]
         output, after = self.network(state, *(x.unsqueeze(2) for x in team))
         return output.transpose(2, 3), after

@@ -117,6 +117,8 @@ class Learner(ABC):
     """
 
     config_type: ClassVar[type[LearnerConfig]]
+    config: Any
+    context: LearnerContext
     actor: Any
     """the actors of all UAVs, without exploration noise, a TensorDict module with the networks in
     `module`"""

@@ -96,8 +96,8 @@ class MAPPOConfig(IPPOConfig):
     """Stores the settings of MAPPO."""
 
     critic_map: bool = False
-    """whether the critic, in training, reads the true map of burning cells, seen and not seen, instead
-    of the UAVs' windows and pictures"""
+    """whether the critic, in training, reads the true map instead of windows and pictures: the
+    shares of seen and unseen burning cells in squares"""
 
     @property
     def reads_map(self) -> bool:
@@ -109,8 +109,6 @@ class PPO(Learner, ABC):
 
     IPPO and MAPPO define the critics.
     """
-
-    config: Any
 
     def __init__(self, config: Any, context: LearnerContext):
         self.config, self.context = config, context
