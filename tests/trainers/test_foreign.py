@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,10 @@ from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.base import SCRIPTED, Scripted
 from emberlink.trainers.cli.main import main
+from emberlink.trainers.comparison.reading import read_all
 from emberlink.trainers.evaluation.export import export
 from emberlink.trainers.evaluation.foreign import FOREIGN, OnnxPolicy, new_run, reference_of
-from emberlink.trainers.evaluation.policy import opened
+from emberlink.trainers.evaluation.policy import adopted, opened
 
 WORLD = {"setup": "tuned", "horizon": 20, "num_uavs": 3, "evaluation.scripted": []}
 SOURCE = """
@@ -36,6 +38,7 @@ def turn(observation, state):
 def fails(observation):
     raise ValueError("no fuel")
 shrinks = lambda observation: observation[0, :, :3]
+divides = lambda observation: observation[..., :3] / 0
 """
 
 
@@ -155,13 +158,19 @@ def test_a_dictionary_where_an_observation_has_several_tensors():
     [
         ("mine.py:fails", r"mine: ValueError: no fuel \(.*mine.py:13\)"),
         ("mine.py:shrinks", r"mine: .*\[3, 3\]; expected \[50, 3, 3\]"),
+        ("mine.py:divides", "mine: an action is NaN or infinite"),
         ("mine.py:rises", "known: rise, turn"),
     ],
 )
 def test_a_policy_that_fails_is_one_line_with_its_name(source, name, message):
     with pytest.raises(UserError, match=message) as error:
-        score(name, name="mine")
+        score(name, name="mine", **{"evaluation.scripted": ["stationary"]})
     assert "\n" not in str(error.value)
+    for folder in Path().glob("runs/*"):  # none if there is no such policy
+        saved = json.loads((folder / "eval.json").read_text())
+        assert list(saved["results"]["huygens"]) == ["stationary"]
+        ((_, why),) = read_all([folder])[1]
+        assert saved["failed"] in why
 
 
 class Broken(Scripted):
@@ -199,13 +208,28 @@ def test_comparisons_and_replays_read_its_folder(source, capsys):
 
 def test_a_folder_that_names_code_inside_it_is_refused(tmp_path):
     config = replace(trainers.load("pretrained:consensus").config, output=str(tmp_path))
-    for place in ("{run}/evil.py:act", "evil.py:act", "os:system", ""):
+    for place in ("{run}/evil.py:act", "evil.py:act", "os:system"):
         run = new_run("", "evil", config)
         (run.path / "evil.py").write_text("raise SystemExit('ran')")
         reference = place.format(run=run.path)
         (run.path / FOREIGN).write_text(json.dumps({"name": "evil", "policy": reference}))
         with pytest.raises(UserError, match="names no policy outside of its folder"):
             reference_of(run)
+    with pytest.raises(UserError, match="its policy was an object"):
+        reference_of(new_run("", "object", config))
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "message"),
+    [
+        ("strong/maps", "consensus", "strong/maps: a policy of maps .*'crops'.* consensus "),
+        ("consensus", "independent", "consensus: a policy of consensus .* independent "),
+        ("strong/independent", "shared_memory", ""),
+    ],
+)
+def test_a_policy_of_another_method_flies_where_it_observes_the_same(name, method, message):
+    with pytest.raises(UserError, match=message) if message else nullcontext():
+        adopted(f"pretrained:{name}", method)
 
 
 def exported(run, tmp_path):
@@ -247,10 +271,14 @@ def test_an_onnx_file_acts_like_the_run(settings, tmp_path):
         **{**TINY, **settings},
     )
     policy, onnx = exported(run.path, tmp_path)
+    late = policy.config.env.radio.delay > 0
     check_same_actions(policy, onnx, 40)
     if settings.get("share_parameters"):
         other = trainers.load(run.path, num_uavs=5)
         check_same_actions(other, onnx, 20, num_envs=3)
+    for key, made in {"num_uavs": 3, "radio.delay": 7}.items() if late else ():
+        with pytest.raises(UserError, match=f"policy.onnx: env.{key}=5; .* for env.{key}={made}"):
+            adopted(str(tmp_path / "policy.onnx"), "independent", [f"env.{key}=5"])
     card = json.loads((tmp_path / "policy.json").read_text())
     assert card["method"] == "independent"
     assert list(card["inputs"]) == list(onnx.inputs)

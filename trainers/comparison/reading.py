@@ -56,6 +56,8 @@ class Evaluation:
     """fire -> description of the held-out fires"""
     message_fault: str = "none"
     """`evaluation.message_fault`"""
+    failed: str = ""
+    """why there are no results of a policy that emberlink has not trained"""
     environment: Settings = Field(default_factory=dict)
     """settings of the environment"""
     communication: dict[str, Settings] = Field(default_factory=dict)
@@ -171,7 +173,8 @@ def read_evaluation(file: Path) -> Evaluation:
         raise UserError(f"{file}: {' '.join(describe(error).split())[:300]}") from None
     for fire, policies in evaluation.results.items():
         if LEARNED not in policies:
-            raise UserError(f"{file}: results.{fire} has no policy {LEARNED!r}")
+            why = evaluation.failed or f"results.{fire} has no policy {LEARNED!r}"
+            raise UserError(f"{file}: {why}")
         for policy, measured in policies.items():
             if any(len(values) != evaluation.fires for values in measured.values()):
                 raise UserError(f"{file}: {policy} on {fire}: not {evaluation.fires} episodes")

@@ -25,7 +25,7 @@ from emberlink.trainers.comparison.bootstrap import FEW
 from emberlink.trainers.comparison.comparison import Comparison, about
 from emberlink.trainers.comparison.rankings import differing, trained_on
 from emberlink.trainers.comparison.tables import Frame
-from emberlink.trainers.evaluation.scores import CURVES, DIGITS, LEARNED
+from emberlink.trainers.evaluation.scores import DIGITS, LEARNED
 from emberlink.trainers.terminal.console import plain_table
 
 NONE = "-"
@@ -266,18 +266,20 @@ def _latex(comparison: Comparison) -> str:
 
 
 def _marl_eval(comparison: Comparison) -> str:
-    """Returns environment, section, label, run, step and measures as JSON that MARL-eval reads."""
+    """Returns JSON that MARL-eval reads: the same measures at each step, no comma in a label."""
     tasks: dict[str, Any] = {}
     for row in comparison.runs[comparison.runs["as_trained"]].itertuples():
         run: Any = row.object
+        tested = [*run.evaluation.results.values()][-1][LEARNED]
+        both = [name for name in tested if all(name in line for line in run.lines)]
         a_line = run.settings["env.horizon"] * run.settings["num_envs"]
         steps: dict[str, Any] = {
             f"step_{line['episode']}": {"step_count": line["episode"] * a_line}
-            | {name: [line[name]] for name in CURVES}
+            | {name: [line[name]] for name in both}
             for line in run.lines
         }
-        steps["absolute_metrics"] = [*run.evaluation.results.values()][-1][LEARNED]
-        runs = tasks.setdefault(str(row.section), {}).setdefault(str(row.label), {})
+        steps["absolute_metrics"] = {name: tested[name] for name in both}
+        runs = tasks.setdefault(str(row.section), {}).setdefault(row.label.replace(",", ""), {})
         runs[f"run_{row.seed}"] = steps
     return json.dumps({"emberlink": tasks}) + "\n"
 

@@ -10,7 +10,7 @@ from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain, shown
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.config.values import GROUPS, change, check_not_removed, composed, flat, put
+from emberlink.trainers.config.values import GROUPS, change, composed, flat, put
 
 
 def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
@@ -91,8 +91,6 @@ def differences(
 
 def from_values(values: Mapping[str, Any]) -> RunConfig:
     """Returns a configuration from plain values, such as the content of a config.yaml."""
-    for key, value in flat(values).items():
-        check_not_removed(key, value)
     return from_plain(RunConfig, values)
 
 

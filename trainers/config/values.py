@@ -31,19 +31,6 @@ from emberlink.envs.utils.validation import plain
 
 GROUPS = ("setup", "world", "fire", "learner")
 """groups whose file is chosen by `GROUP=NAME`, besides the method"""
-REMOVED: dict[str, str] = {
-    "executor.seeds": "each seed is a run: seed=0,1,2",
-    "executor.share": "each run is a job; executor.gpus=0.25 of executor=ray shares a GPU",
-    "executor.restarts": "a killed run is listed at the end; the same command resumes it",
-    "on_nan": "NaN or Inf ends a run; train a new one with smaller learning rates",
-    "keep_checkpoints": "a run keeps its newest and its best checkpoint",
-    "seeds": "a run trains one seed; several: emberlink sweep METHOD seed=0,1,2",
-    "learner.anchor": "learner.warm_start begins with the actors of another run",
-    "learner.burn_in": "the state of the memory before a sequence is stored with it",
-    "policy.decisions": "policy.memory=gru remembers earlier decisions",
-    "policy.memory=stack": "policy.memory=gru remembers earlier decisions",
-}
-"""key, or key=value -> a sentence about what to use instead"""
 _HYDRA = threading.RLock()
 
 
@@ -86,7 +73,6 @@ def change(
     given = [parse(text) for text in overrides]
     given += [(full_key(known, name), plain(value)) for name, value in (settings or {}).items()]
     for key, value in given:
-        check_not_removed(key, value)
         group, _, last = key.partition(".")
         masks = (key, value) == ("fire.kind", "masks")  # of a file
         if group in GROUPS and last in ("", "name", "kind") and not masks:
@@ -157,13 +143,6 @@ def full_key(known: Sequence[str], key: str) -> str:
     if len(matching) > 1:
         raise UserError(f"key {key!r} is ambiguous: {', '.join(matching)}")
     return matching[0] if matching else key
-
-
-def check_not_removed(key: str, value: Any = None) -> None:
-    """Raises a UserError that names what replaces a key of an earlier version."""
-    for name in (key, f"{key}={value}"):
-        if name in REMOVED:
-            raise UserError(f"{name} is no longer a setting: {REMOVED[name]}")
 
 
 def unknown_key(key: str, known: Iterable[str]) -> str:

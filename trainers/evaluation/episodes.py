@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
@@ -116,14 +117,13 @@ def play_side_by_side(
         report: called with a line of text after each episode.
     """
     world = panels[0].config.env
-    for panel in panels:
-        for name in SHARED:
-            expected, actual = getattr(world, name), getattr(panel.config.env, name)
-            if actual != expected:
-                raise UserError(
-                    f"{panel.title} has env.{name}={actual}, {panels[0].title} has {expected}: "
-                    f"side by side, {', '.join(SHARED)} must be the same"
-                )
+    for panel, name in product(panels, SHARED):
+        expected, actual = getattr(world, name), getattr(panel.config.env, name)
+        if actual != expected:
+            raise UserError(
+                f"{panel.title} has env.{name}={actual}, {panels[0].title} has {expected}: "
+                f"side by side, {', '.join(SHARED)} must be the same"
+            )
     name, scenario, index = find_fire(fire, panels[0].config)
     arrival = fires_of(scenario).test_fire(index, world.grid, world.horizon)
     episodes = []

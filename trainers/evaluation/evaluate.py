@@ -47,10 +47,6 @@ Watch = Callable[[TransformedEnv, TensorDictBase], None]
 of the reset, or the "next" of the step"""
 
 
-class NonFiniteActionError(UserError):
-    """Reports the first action of an episode that is NaN or infinite."""
-
-
 def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dict[str, Tensor]:
     """Plays one episode in each environment with a policy that adds no noise.
 
@@ -58,7 +54,7 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
         The measures of `metrics.names`, float32 [num_envs] each.
 
     Raises:
-        NonFiniteActionError: an action is NaN or infinite.
+        UserError: an action is NaN or infinite.
     """
     world: Any = env.base_env
     steps: list[TensorDictBase] = []
@@ -78,13 +74,8 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
                 watch(env, after)
             steps.append(metrics.measured_steps(after.unsqueeze(1)))
             td = step_mdp(td, keep_other=True)
-    wrong = ~torch.stack(actions).isfinite()
-    if wrong.any():
-        step, environment, uav, _ = wrong.nonzero()[0].tolist()
-        raise NonFiniteActionError(
-            f"the policy's action is NaN or infinite for UAV {uav} of environment {environment} at "
-            f"step {step + 1}"
-        )
+    if not torch.stack(actions).isfinite().all():
+        raise UserError("an action of the policy is NaN or infinite")
     episode: Any = torch.cat(cast(Any, steps), 1)
     return metrics.episode_metrics(episode)
 
@@ -121,7 +112,7 @@ def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
 
 def evaluate(
     config: RunConfig,
-    actor: Policy,
+    actor: Policy | None,
     *,
     fires: int,
     report: Callable[[str, str], None] = lambda *_: None,
@@ -134,6 +125,7 @@ def evaluate(
     product depends on the number of rows.
 
     Args:
+        actor: the frozen policy; None for the scripted ones alone.
         fires: number of test fires, one episode each.
         report: called with the names of the fire and the policy before each evaluation.
         watch: watches the first batch of the frozen policy on the fires of `shown_scenario`.
@@ -144,9 +136,11 @@ def evaluate(
     results: Results = {}
     for fire, arrival in evaluation_fires(config, fires).items():
         say = partial(report, fire)
-        say(LEARNED)
-        watched = watch if fire == shown_scenario(config) else None
-        results[fire] = {LEARNED: play_learned(config, actor, arrival, watch=watched)}
+        results[fire] = {}
+        if actor is not None:
+            say(LEARNED)
+            watched = watch if fire == shown_scenario(config) else None
+            results[fire][LEARNED] = play_learned(config, actor, arrival, watch=watched)
         for name in config.evaluation.scripted:
             try:
                 results[fire][name] = play_scripted(config, name, arrival, report=say)

@@ -5,6 +5,7 @@ import hashlib
 import re
 from collections.abc import Callable
 from dataclasses import asdict
+from typing import Any
 
 from rich.console import Console
 
@@ -76,16 +77,26 @@ def evaluate_run(
         fires: number of test fires, one episode each; `evaluation.episodes` if None.
         report: see `evaluate.evaluate`.
         label: suffix of the file names.
+
+    Raises:
+        UserError: the policy fails; if it is not of emberlink, eval.json has the scripted ones.
     """
     with naming(run.path / "figures"):
         run.figures()  # an unusable folder is an error before the episodes, not after
     config, checkpoint = policy.config, policy.checkpoint
     fires = fires or config.evaluation.episodes
     recorder = recorder_of(config, policy)
-    watched = {"report": report, "watch": recorder.add}
-    results = evaluate.evaluate(config, policy.actor, fires=fires, **watched)
-    shown = Episode(title=title_of(config, *policy.changes), recording=recorder.recording())
-    _draw(run, config, results, shown, label)
+    say: dict[str, Any] = {"fires": fires, "report": report}
+    failed = ""
+    try:
+        results = evaluate.evaluate(config, policy.actor, watch=recorder.add, **say)
+    except UserError as error:
+        if checkpoint.name != FOREIGN or not config.evaluation.scripted:
+            raise
+        results, failed = evaluate.evaluate(config, None, **say), str(error)
+    else:
+        shown = Episode(title=title_of(config, *policy.changes), recording=recorder.recording())
+        _draw(run, config, results, shown, label)
     scenarios = evaluate.evaluation_scenarios(config)
     policies = next(iter(results.values()))
     content = {
@@ -97,7 +108,6 @@ def evaluate_run(
         "checkpoint": checkpoint.name,
         "step": 0 if checkpoint.name == FOREIGN else read_header(checkpoint).step,
         "fires": fires,
-        "start_seeds": list(range(evaluate.START_SEED, evaluate.START_SEED + fires)),
         "held_out": {name: fires_of(scenarios[name]).describe(fires) for name in results},
         "environment": asdict(config.env),
         "communication": {
@@ -108,8 +118,11 @@ def evaluate_run(
         "device": config.device,
         "versions": versions(),
         "results": results,
+        "failed": failed,
     }
     run.write(f"eval{label}.json", content)  # last: an evaluation with this file is complete
+    if failed:
+        raise UserError(f"{failed}; results of the others: {run.path / f'eval{label}.json'}")
     return results
 
 

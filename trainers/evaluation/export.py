@@ -14,12 +14,7 @@ from torch.export import Dim
 
 from emberlink.envs.utils.atomic_io import created, new_file
 from emberlink.envs.utils.errors import UserError, require
-from emberlink.envs.utils.validation import shown
-from emberlink.policies.networks.messages import message_lag
 from emberlink.trainers.build import make_env
-from emberlink.trainers.config.compose import to_values
-from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.config.values import flat
 from emberlink.trainers.evaluation.foreign import METADATA, foreign_name
 from emberlink.trainers.evaluation.policy import TrainedPolicy, load_policy
 from emberlink.trainers.evaluation.scores import LEARNED, means
@@ -46,16 +41,13 @@ class Decision(nn.Module):
     def __init__(self, policy: TrainedPolicy):
         super().__init__()
         self.policy: Any = policy.decision
-        self.reads, self.writes = list(self.policy.in_keys), list(self.policy.out_keys)
-        self.inputs = [key if isinstance(key, str) else key[-1] for key in self.reads]
-        self.outputs = ["next_" * (key[0] == "next") + key[-1] for key in self.writes]
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         td = TensorDict({}, batch_size=tensors[0].shape[:1])
-        for key, tensor in zip(self.reads, tensors, strict=True):
+        for key, tensor in zip(self.policy.in_keys, tensors, strict=True):
             td.set(key, tensor)
         out = self.policy(td)
-        return tuple(out.get(key) for key in self.writes)
+        return tuple(out.get(key) for key in self.policy.out_keys)
 
 
 def export(run: str | PathLike[str], file: str | Path) -> tuple[Path, Path]:
@@ -73,7 +65,8 @@ def export(run: str | PathLike[str], file: str | Path) -> tuple[Path, Path]:
     decision = Decision(policy)
     fire = torch.full(policy.config.env.grid, torch.inf)
     start = make_env(policy.config, num_envs=3, fire=fire, seed=0).reset()
-    example = tuple(start.get(key) for key in decision.reads)
+    example, card = tuple(start.get(key) for key in decision.policy.in_keys), card_of(policy)
+    grows = policy.config.env.num_uavs if card["any_team"] else None
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # of operators of packages not used
     with warnings.catch_warnings(action="ignore", category=FutureWarning):  # of torch's own code
         program: Any = torch.onnx.export(
@@ -81,11 +74,10 @@ def export(run: str | PathLike[str], file: str | Path) -> tuple[Path, Path]:
             example,
             dynamo=True,
             verbose=False,
-            input_names=decision.inputs,
-            output_names=decision.outputs,
-            dynamic_shapes=(tuple(_dynamic(policy.config, x) for x in example),),
+            input_names=list(card["inputs"]),
+            output_names=list(card["outputs"]),
+            dynamic_shapes=(tuple(_dynamic(x, grows) for x in example),),
         )
-    card = card_of(policy, decision, example)
     program.model.metadata_props[METADATA] = json.dumps(card)
     with created(path) as partial:
         program.save(partial)
@@ -94,41 +86,24 @@ def export(run: str | PathLike[str], file: str | Path) -> tuple[Path, Path]:
     return path, card_path
 
 
-def _dynamic(config: RunConfig, tensor: Tensor) -> dict[int, Any]:
-    """Returns the dimensions that an ONNX file leaves open: environments and, if weights are
-    shared, UAVs."""
-    team, shared = config.env.num_uavs, config.learner.share_parameters
-    grows = shared and not config.policy.agent_index and config.comm["name"] != "positional"
-    grows &= not message_lag(config.policy, config.env.radio)  # the links of the team in flight
+def _dynamic(tensor: Tensor, grows: int | None) -> dict[int, Any]:
+    """Returns the dimensions that an ONNX file leaves open: environments, and UAVs if it `grows`
+    from a team of so many."""
     return {
         place: Dim.DYNAMIC
         for place, size in enumerate(tensor.shape[:3])
-        if place == 0 or (grows and size == team and (place == 1 or tensor.dtype == torch.bool))
+        if place == 0 or (size == grows and (place == 1 or tensor.dtype == torch.bool))
     }
 
 
-def card_of(
-    policy: TrainedPolicy, decision: Decision, example: tuple[Tensor, ...]
-) -> dict[str, Any]:
+def card_of(policy: TrainedPolicy) -> dict[str, Any]:
     """Returns facts for the user of an exported policy, as plain values."""
-    config, values = policy.config, flat(to_values(policy.config))
-    file = policy.checkpoint.with_name("eval.json")
+    file, card = policy.checkpoint.with_name("eval.json"), policy.card
     results = json.loads(read_text(file, MAX_JSON))["results"] if file.exists() else {}
-    shapes = zip(decision.inputs, example, strict=True)
-    return {
-        "method": config.method,
-        "settings": policy.settings,
-        "decides_every": config.policy.hold,
-        "inputs": {
-            name: {
-                "shape": ["environments", *x.shape[1:]],
-                "dtype": str(x.dtype).removeprefix("torch."),
-                "meaning": MEANING.get(name, ""),
-            }
-            for name, x in shapes
-        },
-        "outputs": {name: MEANING.get(name, "") for name in decision.outputs},
-        "world": {key: shown(value) for key, value in values.items() if key.startswith("env.")},
+    for name, about in card["inputs"].items():
+        about["meaning"] = MEANING.get(name, "")
+    return card | {
+        "outputs": {name: MEANING.get(name, "") for name in card["outputs"]},
         "checkpoint": {"file": policy.checkpoint.name, "step": read_header(policy.checkpoint).step},
         "scores": {fire: means(policies[LEARNED]) for fire, policies in results.items()},
         "versions": versions(),

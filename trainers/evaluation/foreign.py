@@ -134,7 +134,7 @@ class OnnxPolicy:
         if "action" not in self.outputs:
             raise UserError(f"{file}: has no output 'action'; outputs: {', '.join(self.outputs)}")
         text = self.session.get_modelmeta().custom_metadata_map.get(METADATA, "{}")
-        self.settings: list[str] = json.loads(text).get("settings", [])
+        self.card: dict[str, Any] = json.loads(text)
 
     def __call__(self, tensordict: TensorDictBase, state: Any) -> tuple[Tensor, Any]:
         place, given = tensordict.get(keys.POSITION), {}
@@ -179,6 +179,9 @@ def reference_of(run: RunFolder) -> str:
     """
     text = _read(run, "policy")
     file = Path(_split(text)[0] or text)
+    if not text:
+        why = "its policy was an object, which cannot be opened again; file.py:NAME can"
+        raise UserError(f"{run.path}: {why}")
     inside = run.path.resolve() in (file.resolve(), *file.resolve().parents)
     if inside or not file.is_absolute():
         raise UserError(f"{run.path / FOREIGN}: names no policy outside of its folder: {text!r}")
@@ -252,6 +255,6 @@ def _module(place: str) -> Any:
 def takes_state(policy: Callable[..., Any]) -> bool:
     """Returns whether a function, or a module's `forward`, has a second argument, None at first."""
     call = policy.forward if isinstance(policy, nn.Module) else policy
-    by_place = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    placed = [one for one in inspect.signature(call).parameters.values() if one.kind in by_place]
-    return len(placed) > 1 and (placed[1].default is None or placed[1].default is placed[1].empty)
+    second = [*inspect.signature(call).parameters.values()][1:2]
+    by_place = [one for one in second if one.kind <= one.POSITIONAL_OR_KEYWORD]
+    return any(one.default is None or one.default is one.empty for one in by_place)

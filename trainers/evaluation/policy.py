@@ -14,6 +14,7 @@ from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.policies.hold import Held, held
+from emberlink.policies.networks.messages import message_lag
 from emberlink.policies.state import primer_of
 from emberlink.trainers.build import build_actor, empty_env
 from emberlink.trainers.config.compose import differences, evaluated_with, resolve, to_values
@@ -37,6 +38,7 @@ from emberlink.trainers.runs.run_folder import RunFolder
 
 _CHANGEABLE = ("world", "edition", "fire", "env", "comm", "evaluation")
 """groups of keys that an evaluation can change"""
+_OBSERVED = tuple(name for _, name in keys.NETWORKS_READ)
 _UNITS = ("altitude", "horizon", "displacement", "view_angle", "observation_scale")
 
 
@@ -78,13 +80,32 @@ class TrainedPolicy(TensorDictSequential):
         return self.actor.policy if isinstance(self.actor, Held) else self.actor
 
     @property
-    def settings(self) -> list[str]:
-        """Settings of its environment and of how it decides, as texts `key=value`."""
-        values = flat(to_values(self.config))
-        names = [f"{key}={values[key]}" for key in ("setup", "world")]
-        changed = differences(self.config, resolve(self.config.method, names))
+    def card(self) -> dict[str, Any]:
+        """Facts for its user, as plain values: how it was made, and what it reads and writes."""
+        config, decision = self.config, self.decision
+        values, env = flat(to_values(config)), empty_env(config)
+        env.append_transform(primer_of(decision))
+        spec = env.observation_spec
+        made = [f"{key}={values[key]}" for key in ("setup", "world")]
+        changed = differences(config, resolve(config.method, made))
         own = [key for key in changed if key.startswith(("env.", "comm.", "policy."))]
-        return [*names, *(f"{key}={shown(values[key])}" for key in own)]
+        tied = config.policy.agent_index or config.comm["name"] == "positional"
+        tied |= message_lag(config.policy, config.env.radio) > 0  # the team's links in flight
+        return {
+            "method": config.method,
+            "settings": [*made, *(f"{key}={shown(values[key])}" for key in own)],
+            "decides_every": config.policy.hold,
+            "any_team": config.learner.share_parameters and not tied,
+            "inputs": {
+                key if isinstance(key, str) else key[-1]: {
+                    "shape": ["environments", *spec[key].shape[1:]],
+                    "dtype": str(spec[key].dtype).removeprefix("torch."),
+                }
+                for key in decision.in_keys
+            },
+            "outputs": ["next_" * (key[0] == "next") + key[-1] for key in decision.out_keys],
+            "world": {key: shown(value) for key, value in values.items() if key.startswith("env.")},
+        }
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Returns a transform that adds the policy's state to an environment; `make_env` does."""
@@ -141,14 +162,14 @@ def load_policy(
     given = {**dict(parse(text) for text in overrides), **(settings or {})}
     config = evaluated_with(trained, given)
     changed = differences(trained, config)
-    fixed = [key for key in changed if key.partition(".")[0] not in _CHANGEABLE]
-    if fixed:
+    if fixed := [key for key in changed if key.partition(".")[0] not in _CHANGEABLE]:
         raise UserError(
             f"{', '.join(fixed)}: an evaluation changes only keys of {', '.join(_CHANGEABLE)}"
         )
     changes = [*overrides, *(f"{key}={shown(value)}" for key, value in (settings or {}).items())]
     if file is None:
-        return foreign_policy(opened(reference_of(run))[0], name, config, changes)
+        place = reference_of(run)
+        return foreign_policy(opened(place)[0], place, name, config, changes)
     return TrainedPolicy(load_actor(config, file), config, file, changes)
 
 
@@ -171,23 +192,48 @@ def adopted(
     Args:
         policy: see `foreign.ForeignPolicy`; or a text, or a run's folder, see `opened`.
     """
-    reference = ""
+    place, reference = name or "policy", ""
     if isinstance(policy, str | PathLike):
-        policy, reference = opened(fspath(policy))
-    usual = policy.settings if isinstance(policy, TrainedPolicy | OnnxPolicy) else ()
+        place = fspath(policy)
+        policy, reference = opened(place)
+    usual = _card(policy).get("settings", ())
+    if usual and _card(policy)["method"] != method:
+        usual = [text for text in usual if not text.startswith("comm.")]
     config = resolve(method, [*usual, *overrides], **settings)
-    return foreign_policy(policy, name, config), reference
+    return foreign_policy(policy, place, name, config), reference
 
 
 def foreign_policy(
-    policy: Any, name: str, config: RunConfig, changes: Sequence[str] = ()
+    policy: Any, place: str, name: str, config: RunConfig, changes: Sequence[str] = ()
 ) -> TrainedPolicy:
-    """Returns a policy of any kind, which decides as often as `policy.hold` says."""
+    """Returns a policy of any kind, which decides as often as `policy.hold` says.
+
+    Raises:
+        UserError: it is emberlink's, and does not fit the configuration.
+    """
+    spec = empty_env(config).observation_spec
+    observed = keys.observation_keys(spec)
+    if card := _card(policy):
+        values = flat(to_values(config))
+        fixed = [] if card["any_team"] else ["env.num_uavs"]
+        fixed += ["env.radio.delay"] * ("hears" in card["inputs"])  # of learned messages
+        for key in fixed:
+            if (now := shown(values[key])) != (made := card["world"][key]):
+                raise UserError(f"{place}: {key}={now}; its networks are for {key}={made}")
+        here = {name: [*spec[group, name].shape[2:]] for group, name in observed}
+        read = {name: one["shape"][2:] for name, one in card["inputs"].items() if name in _OBSERVED}
+        if read != here:
+            made = f"a policy of {card['method']} observes {read}"
+            raise UserError(f"{place}: {made}, and {config.method} observes {here}")
     policy = policy.decision if isinstance(policy, TrainedPolicy) else policy
-    observed = keys.observation_keys(empty_env(config).observation_spec)
     actor: Any = ForeignPolicy(policy, name or "policy", observed)
     actor = held(actor, config.policy.hold, config.env.num_uavs)
     return TrainedPolicy(actor, config, Path(FOREIGN), [*filter(None, [name]), *changes])
+
+
+def _card(policy: Any) -> dict[str, Any]:
+    """Returns the card of a policy that emberlink has trained or exported; else an empty one."""
+    return policy.card if isinstance(policy, TrainedPolicy | OnnxPolicy) else {}
 
 
 def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:

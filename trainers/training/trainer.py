@@ -190,10 +190,7 @@ class Trainer:
         line = {"episode": setup.episode, "updates": setup.learner.updates} | measures
         setup.record.clear()
         if interval and setup.episode % interval == 0:
-            try:
-                line |= evaluate.validate(self.config, setup.actor)
-            except evaluate.NonFiniteActionError:
-                raise self._non_finite("an action of the validation") from None
+            line |= evaluate.validate(self.config, setup.actor)
         self._keep_best(line)
         self.tracker.log(line)  # first, since a new tracker logs the lines before it
         self.run.append(line)

@@ -1,8 +1,5 @@
 """Tests `emberlink render`: its files, their contents, and its errors."""
 
-import os
-from pathlib import Path
-
 import imageio_ffmpeg
 import numpy as np
 import torch
@@ -71,18 +68,6 @@ def test_a_run_gives_a_gif_and_an_mp4_that_play(tmp_path, capsys):
     for frame, shot in zip(frames, shots, strict=True):
         assert np.abs(frame.astype(int) - shot.reshape(frame.shape)).mean() < 4
     assert not list(run.rglob(".*"))
-
-
-def test_a_second_rendering_takes_another_name(tmp_path, capsys):
-    run = make_run(tmp_path)
-    first = rendered(capsys, run, "--frames", 2)[-2:]
-    before = [Path(path).read_bytes() for path in first]
-    second = rendered(capsys, run, "--frames", 3)[-2:]
-    assert [os.path.basename(path) for path in second] == [
-        *("episode_huygens_0_2.gif", "episode_huygens_0_2.mp4")
-    ]
-    assert [Path(path).read_bytes() for path in first] == before
-    assert [len(gif_frames(path)) for path in (first[0], second[0])] == [2, 3]
 
 
 def test_episodes_side_by_side_have_the_same_fire_and_starts(tmp_path):

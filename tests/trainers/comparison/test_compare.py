@@ -330,6 +330,8 @@ def test_extras(runs, comparison, tmp_path):
     ((_, algorithms),) = tasks.items()
     assert sorted(algorithms["consensus"]) == ["run_0", "run_1", "run_2"]
     first = algorithms["consensus"]["run_0"]
+    measures = {frozenset(step) - {"step_count"} for step in first.values()}
+    assert len(measures) == 1, "MARL-eval wants the same ones everywhere"
     assert first["absolute_metrics"]["coverage"] == [45, 55, 45, 55]
     assert [first[f"step_{i}"]["step_count"] for i in (1, 2, 3)] == [40 * 16 * i for i in (1, 2, 3)]
 

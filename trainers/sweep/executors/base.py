@@ -15,7 +15,7 @@ from emberlink.envs.utils.config_files import read
 from emberlink.envs.utils.errors import UserError, unknown
 from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.utils.validation import from_plain
-from emberlink.trainers.config.values import check_not_removed, parse
+from emberlink.trainers.config.values import parse
 
 Positive = Annotated[int, Field(ge=1)]
 DIED = -9
@@ -93,7 +93,6 @@ def make(arguments: Sequence[str]) -> Executor:
     executor = EXECUTORS.find(name)
     values = {key: value for key, value in read("executor", name).items() if key != "name"}
     for key, value in given.items():
-        check_not_removed(key)
         first, _, option = key.removeprefix("executor.").partition(".")
         if first not in values:
             raise UserError(f"key {unknown(key, [f'executor.{known}' for known in values])}")
