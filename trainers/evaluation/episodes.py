@@ -111,10 +111,7 @@ def play_side_by_side(
 ) -> tuple[str, list[Episode]]:
     """Plays the same episode of each panel and returns the name of the fire and the episodes.
 
-    Args:
-        panels: the policies to show side by side.
-        fire: see `find_fire`.
-        report: called with a line of text after each episode.
+    `report` is called with a line of text after each; for `fire` see `find_fire`.
     """
     world = panels[0].config.env
     for panel, name in product(panels, SHARED):

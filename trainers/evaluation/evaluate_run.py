@@ -5,7 +5,7 @@ import hashlib
 import re
 from collections.abc import Callable
 from dataclasses import asdict
-from typing import Any
+from functools import partial
 
 from rich.console import Console
 
@@ -86,14 +86,13 @@ def evaluate_run(
     config, checkpoint = policy.config, policy.checkpoint
     fires = fires or config.evaluation.episodes
     recorder = recorder_of(config, policy)
-    say: dict[str, Any] = {"fires": fires, "report": report}
-    failed = ""
+    play, failed = partial(evaluate.evaluate, config, fires=fires, report=report), ""
     try:
-        results = evaluate.evaluate(config, policy.actor, watch=recorder.add, **say)
+        results = play(policy.actor, watch=recorder.add)
     except UserError as error:
         if checkpoint.name != FOREIGN or not config.evaluation.scripted:
             raise
-        results, failed = evaluate.evaluate(config, None, **say), str(error)
+        results, failed = play(None), str(error)
     else:
         shown = Episode(title=title_of(config, *policy.changes), recording=recorder.recording())
         _draw(run, config, results, shown, label)

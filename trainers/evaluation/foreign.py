@@ -154,12 +154,9 @@ class OnnxPolicy:
 
 
 def new_run(reference: str, name: str, config: RunConfig) -> RunFolder:
-    """Creates a run folder for a policy that emberlink has not trained.
+    """Creates a run folder for a policy that emberlink has not trained, called `name`.
 
-    Args:
-        reference: from `open_policy`, by which later commands open it; empty if they can't.
-        name: what comparisons call it.
-        config: of its environment.
+    Later commands open it by `reference`, see `open_policy`; they cannot if it is empty.
     """
     run = RunFolder.create(config, label=re.sub(r"[^\w.=+-]", "-", name))
     run.write(FOREIGN, {"name": name, "policy": reference})

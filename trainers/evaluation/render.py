@@ -52,12 +52,9 @@ def render(options: argparse.Namespace, console: Console) -> int:
 
 
 def learned(arguments: Sequence[str], checkpoints: Sequence[Path] = ()) -> Iterator[Panel]:
-    """Yields a panel for each run.
+    """Yields a panel for each run; an argument `key=value` changes the run before it.
 
-    Args:
-        arguments: run folders or names of trained policies; a text such as `env.radio.range=0`
-            changes a setting of the run before it.
-        checkpoints: a checkpoint for each run; the newest of each run if empty.
+    `checkpoints` has one for each run, or none for the newest ones.
     """
     runs: list[tuple[str, list[str]]] = []
     for text in arguments:

@@ -34,7 +34,8 @@ def tune(
     same command continues, in `output/tune_METHOD_SETUP_WORLD`.
 
     Args:
-        space: a file with the settings to try; the learner's file of configs/space if None.
+        space: a file with the settings to try, besides those in `overrides`; the learner's file of
+            configs/space if None.
         trials: number of trials, with the trials of earlier commands.
     """
     require("optuna", "tune", "tune")
@@ -44,7 +45,8 @@ def tune(
     config = resolve(method, overrides)
     if not config.evaluation.interval:
         raise UserError("evaluation.interval=0: tune chooses by validations, and there are none")
-    ranges = _space(config, space)
+    given = {text.partition("=")[0] for text in overrides}
+    ranges = {key: of for key, of in _space(config, space).items() if key not in given}
     headline = config.evaluation.headline
     folder = user_path(config.output) / f"tune_{method}_{config.setup}_{config.world}"
     with naming(folder):

@@ -20,7 +20,8 @@ TINY = [
 @pytest.fixture
 def space(tmp_path):
     file = tmp_path / "space.yaml"
-    file.write_text("learner.lr: {low: 1.0e-4, high: 1.0e-2, log: true}\nlearner.epochs: [1, 2]\n")
+    text = "learner.lr: {low: 1.0e-4, high: 1.0e-2, log: true}\nlearner.epochs: [1, 2]\n"
+    file.write_text(text + "learner.minibatches: [2]\n")  # which the command gives
     return file
 
 
@@ -53,6 +54,7 @@ def test_an_interrupted_trial_goes_on_with_its_settings(tmp_path, space, monkeyp
     ends = [RunFolder(file.parent).metrics()[-1]["episode"] for file in runs(tmp_path)]
     assert ends[:2] == [3, 3]
     values = [yaml.safe_load(text)["learner"] for text in after]
+    assert {value["minibatches"] for value in values} == {1}
     assert all(1e-4 <= value["lr"] <= 1e-2 and value["epochs"] in (1, 2) for value in values)
     assert not [*tmp_path.glob("*/*/eval.json")]  # test fires are not played
     assert "best: coverage" in capsys.readouterr().out
