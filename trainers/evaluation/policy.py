@@ -83,9 +83,8 @@ class TrainedPolicy(TensorDictSequential):
     def card(self) -> dict[str, Any]:
         """Facts for its user, as plain values: how it was made, and what it reads and writes."""
         config, decision = self.config, self.decision
-        values, env = flat(to_values(config)), empty_env(config)
-        env.append_transform(primer_of(decision))
-        spec = env.observation_spec
+        values = flat(to_values(config))
+        spec: Any = empty_env(config).append_transform(primer_of(decision)).observation_spec
         made = [f"{key}={values[key]}" for key in ("setup", "world")]
         changed = differences(config, resolve(config.method, made))
         own = [key for key in changed if key.startswith(("env.", "comm.", "policy."))]
