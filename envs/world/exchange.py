@@ -41,7 +41,7 @@ class Exchange(nn.Module):
         config: the radio.
         sizes: int64 [items], the bytes of each entry of a map.
         shape: environments and radios.
-        unit: numbers in a map per step.
+        unit: numbers in a map per step, a power of 2.
         header: bytes that a radio says in each step, 2 of them its number.
     """
 
@@ -63,7 +63,9 @@ class Exchange(nn.Module):
     """int64 [envs, r, r, r]: step at which a radio (second) last heard another one (third)
     acknowledge a message of one (last), -1 for never"""
     codes: Tensor
-    """int32 [envs, delay + 1, r, items]: the codes in flight of the entries said at a step"""
+    """int32 [envs, delay + 1, r, items]: the codes of the entries said at a step"""
+    flies: Tensor
+    """bool like `codes`: which entries are in flight"""
     acknowledged: Tensor
     """bool [envs, r, r]: the messages of a radio (row) that others acknowledged at the last step"""
     waits: Tensor
@@ -81,7 +83,7 @@ class Exchange(nn.Module):
         header: int = 2,
     ):
         super().__init__()
-        self.config, self.unit, self.header = config, unit, header
+        self.config, self.bits, self.header = config, unit.bit_length(), header
         self.wait, items = 2 * config.delay + 2, len(sizes)
         (envs, radios), self.shape = shape, (*shape, items)
         self.register_buffer("sizes", sizes, persistent=False)
@@ -99,9 +101,9 @@ class Exchange(nn.Module):
         self.register_buffer("told", nothing.repeat(self.shape))
         self.register_buffer("has", nothing.repeat(*self.shape, radios))
         self.register_buffer("codes", nothing.repeat(envs, config.delay + 1, radios, items))
+        self.register_buffer("flies", torch.zeros_like(self.codes, dtype=torch.bool))
         no = torch.tensor(False)
-        self.messages = Late(config.delay, envs, no, radios, items)
-        self.links, self.acks = (Late(config.delay, envs, no, radios, radios) for _ in range(2))
+        self.links = Late(config.delay, envs, no, 2, radios, radios)
 
     def start_episodes(self, mask: Tensor) -> None:
         """Forgets everything in the environments of a mask, bool [envs]."""
@@ -135,16 +137,10 @@ class Exchange(nn.Module):
         entry, code, spent = self._speak(known, step, left)
         size = self.sizes[entry % self.shape[2]]
         sent = spent.view(-1).index_add(0, entry // self.shape[2], size).view_as(spent)
-        now = hears & (sent > 0).unsqueeze(1)
+        now = torch.stack((hears & (sent > 0).unsqueeze(1), self.got), 1)
+        arrives, acks = self.links(step, now).unbind(1)
         if self.config.delay:
-            said = torch.zeros(self.shape, dtype=torch.bool, device=entry.device)
-            said.view(-1)[entry] = True
-            self.codes.view(-1)[self._in_flight(entry, step)] = code
-            said = self.messages(step, said)
-            entry = _marked(said, torch.ones_like(said[..., 0]))
-            code = self.codes.view(-1)[self._in_flight(entry, step - self.config.delay)]
-        arrives = self.links(step, now)
-        acks = self.acks(step, self.got)
+            entry, code = self._fly(entry, code, step, arrives.any(1))
         self.acknowledged.copy_(arrives & acks.mT)
         told = arrives.unsqueeze(-1) & acks.unsqueeze(1)
         self.reached.copy_(torch.where(told, step.view(-1, 1, 1, 1), self.reached))
@@ -155,11 +151,20 @@ class Exchange(nn.Module):
         passes = (self.contact.unsqueeze(2) & ~reaches).any(-1)
         return sent, arrives, self._listen(known, entry, code, arrives, passes)
 
-    def _in_flight(self, entry: Tensor, step: Tensor) -> Tensor:
-        """Returns the indices into the flat `codes` of entries said at steps, int64 [envs]."""
+    def _fly(
+        self, entry: Tensor, code: Tensor, step: Tensor, heard: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Sends entries with their codes; returns those that arrive from radios that are heard."""
         a_step, slots = self.shape[1] * self.shape[2], self.config.delay + 1
-        env = entry // a_step
-        return (env * (slots - 1) + (step % slots)[env]) * a_step + entry
+        now, env = step % slots, entry // a_step
+        slot = torch.arange(slots, device=step.device)
+        self.flies[torch.arange(len(step), device=step.device), now] = False
+        sent = (env * (slots - 1) + now[env]) * a_step + entry
+        self.flies.view(-1)[sent] = True
+        self.codes.view(-1)[sent] = code
+        due = slot == (now.unsqueeze(-1) + 1) % slots  # the oldest one
+        sent = _marked(self.flies.flatten(0, 1), due.unsqueeze(-1) & heard.unsqueeze(1))
+        return sent // (slots * a_step) * a_step + sent % a_step, self.codes.view(-1)[sent]
 
     def _speak(
         self, known: Knowledge, step: Tensor, left: Tensor | None
@@ -175,25 +180,27 @@ class Exchange(nn.Module):
         mine, theirs = codes(known, entry), self.has.view(-1, radios)[entry]
         now = step[row // radios]
         told, at = self.told.view(-1)[entry], self.told_at.view(-1)[entry]
-        back = self.acknowledged.flatten(0, 1)[row] & (at == now - self.wait).unsqueeze(-1)
-        theirs = torch.where(back, merged(theirs, told.unsqueeze(-1)), theirs)
-        self.has.view(-1, radios)[entry] = theirs
-        recent = (at >= 0) & (now - at < self.wait)
+        due = (at == now - self.wait).nonzero().squeeze(-1)
+        back = self.acknowledged.flatten(0, 1)[row[due]]
+        theirs[due] = merged(theirs[due], torch.where(back, told[due].unsqueeze(-1), _NOTHING))
+        self.has.view(-1, radios)[entry[due]] = theirs[due]
+        told = torch.where((at >= 0) & (now - at < self.wait), told, _NOTHING)
         spent, left = self._open(left)
         lacks = contact.flatten(0, 1)[row] & newer(mine.unsqueeze(-1), theirs)
-        says = lacks.any(-1)
-        self.pending.view(-1)[entry] = says
-        says = says & ~(recent & (told == mine))
+        wanted = lacks.any(-1)
+        self.pending.view(-1)[entry] = wanted
+        says = (wanted & (told != mine)).nonzero().squeeze(-1)
         if left is not None:
-            size, wanted = self.sizes[entry % items], says.clone()
-            says &= size <= left.view(-1)[row]
-            expected = torch.where(recent.unsqueeze(-1), merged(theirs, told.unsqueeze(-1)), theirs)
-            gain = (self._gain(mine.unsqueeze(-1), expected) * lacks).sum(-1)[says]
-            says[says.clone()] = self._fits(entry[says], gain, size[says], left.view(-1))
-            self.waits.zero_().view(-1).index_add_(0, row, size * (wanted & ~says))
+            size, waits = self.sizes[entry % items], self.waits.zero_().view(-1)
+            waits.index_add_(0, row[says], size[says])
+            says = says[(size <= left.view(-1)[row])[says]]
+            expected = merged(theirs[says], told[says].unsqueeze(-1))
+            gain = (self._gain(mine[says].unsqueeze(-1), expected) * lacks[says]).sum(-1)
+            says = says[self._fits(entry[says], gain, size[says], left.view(-1))]
+            waits.index_add_(0, row[says], size[says], alpha=-1)
         entry, mine = entry[says], mine[says]
         self.told.view(-1)[entry] = mine
-        self.told_at.view(-1)[entry] = step[entry // items // radios]
+        self.told_at.view(-1)[entry] = now[says]
         return entry, mine, spent
 
     def _open(self, left: Tensor | None) -> tuple[Tensor, Tensor | None]:
@@ -212,8 +219,8 @@ class Exchange(nn.Module):
 
     def _gain(self, mine: Tensor, theirs: Tensor) -> Tensor:
         """Returns the steps by which looks get newer, from step -1 where fire is news."""
-        before = torch.where((mine & ~theirs & 1) > 0, -1, (theirs >> 1) // self.unit)
-        return ((mine >> 1) // self.unit - before).clamp(0, OLD)
+        before = torch.where(mine & 1 > theirs & 1, -1, theirs >> self.bits)
+        return ((mine >> self.bits) - before).clamp(0, OLD)
 
     def _fits(self, entry: Tensor, gain: Tensor, size: Tensor, left: Tensor) -> Tensor:
         """Returns which entries are said: by falling gain, as many as fit, bool [k].
@@ -308,12 +315,12 @@ def codes(known: Knowledge, entry: Tensor) -> Tensor:
 
 def newer(told: Tensor, theirs: Tensor) -> Tensor:
     """Returns whether a code is of a newer look, or of the first one in flames."""
-    return (told >> 1 > theirs >> 1) | (told & ~theirs & 1 > 0)
+    return (told > theirs) | (told & 1 > theirs & 1)
 
 
 def merged(one: Tensor, other: Tensor) -> Tensor:
     """Returns the code of the newer look, with the fire that either has seen."""
-    return torch.maximum(one, other) >> 1 << 1 | (one | other) & 1
+    return torch.maximum(one, other) | (one | other) & 1
 
 
 def _marked(pending: Tensor, rows: Tensor) -> Tensor:
