@@ -147,13 +147,6 @@ class CommModule(TensorDictModuleBase):
             self.maps.show(tensordict, tensordict.get(keys.STEP) % self.hold == 0)
         return tensordict
 
-    def budget(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Returns the bytes that each UAV can say at a step, int64 [num_envs, n].
-
-        Negative for a UAV whose learned message does not fit, None without a limit.
-        """
-        return tensordict.get(keys.BUDGET, None)
-
     @property
     def counts(self) -> bool:
         """Whether the bytes that UAVs send are measured."""
@@ -309,7 +302,7 @@ class Communication(Transform):
             total = total + steps.get(keys.REPORT_BYTES)
         if self.message_bytes and world.radio.range:
             says = alive & (steps.get(keys.STEP) % self.module.hold == 0).unsqueeze(-1)
-            left = self.module.budget(steps)
+            left = steps.get(keys.BUDGET, None)
             total = total + self.message_bytes * (says if left is None else says & (left >= 0))
         return {keys.BYTES_SENT: total}
 

@@ -213,7 +213,7 @@ class Consensus(CommModule):
         uavs, size = discovers.shape[-1], RECORD_BYTES + LATE_BYTES
         own = torch.eye(uavs, dtype=torch.bool, device=discovers.device)
         step, position, hears = (steps.get(k) for k in (keys.STEP, keys.POSITION, keys.HEARS))
-        budget, known, records, sent = self.budget(steps), [], [], []
+        budget, known, records, sent = steps.get(keys.BUDGET, None), [], [], []
         for number, (finds, now) in enumerate(zip(discovers, step, strict=True)):
             stamp = now.view(-1, 1, 1).expand(-1, uavs, 1).double()
             mine = torch.cat((stamp, position[number], rank[number].unsqueeze(-1)), -1)

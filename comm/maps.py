@@ -101,9 +101,9 @@ class Maps(CommModule):
 
     def _talk(self, tensordict: TensorDictBase) -> None:
         """Exchanges messages between UAVs in range, and counts the bytes."""
-        maps, hears, step = self.maps, tensordict.get(keys.HEARS), tensordict.get(keys.STEP)
+        maps, step, left = self.maps, tensordict.get(keys.STEP), tensordict.get(keys.BUDGET, None)
         self.messages.saw(maps.view)
-        sent, _, new = self.messages(maps.known, hears, step, self.budget(tensordict))
+        sent, _, new = self.messages(maps.known, tensordict.get(keys.HEARS), step, left)
         places = self.places(step, maps.place.clone())
         env, hearer, speaker, entry = new[:, new[3] >= self.area]
         uav = entry - self.area

@@ -68,12 +68,9 @@ class Positional(CommModule):
         return observation
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        step, key = (
-            tensordict.get(keys.STEP),
-            keys.OBSERVATION if self.maps is None else keys.POSITION,
-        )
-        vectors, hears = tensordict.get(key), tensordict.get(keys.HEARS)
-        left = self.budget(tensordict)
+        step, left = tensordict.get(keys.STEP), tensordict.get(keys.BUDGET, None)
+        vectors = tensordict.get(keys.OBSERVATION if self.maps is None else keys.POSITION)
+        hears = tensordict.get(keys.HEARS)
         if left is not None:
             hears = hears & (left >= 4 * self.numbers).unsqueeze(-2)
         hears, heard = self.links(step, hears), self.said(step, vectors)
@@ -89,6 +86,6 @@ class Positional(CommModule):
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
         """Returns 24 for each UAV, the six float32 numbers of its vector; 12 for a position."""
-        size, left = 4 * self.numbers, self.budget(tensordict)
+        size, left = 4 * self.numbers, tensordict.get(keys.BUDGET, None)
         sent = torch.full_like(tensordict.get(keys.HEARS)[..., 0], size, dtype=torch.int64)
         return sent if left is None else sent * (left >= size)

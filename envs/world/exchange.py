@@ -134,9 +134,7 @@ class Exchange(nn.Module):
             each radio, bool [envs, r, r]; and which entries have changed by whose message, as
             (environment, hearer, speaker, entry), int64 [4, k].
         """
-        entry, code, spent = self._speak(known, step, left)
-        size = self.sizes[entry % self.shape[2]]
-        sent = spent.view(-1).index_add(0, entry // self.shape[2], size).view_as(spent)
+        entry, code, sent = self._speak(known, step, left)
         now = torch.stack((hears & (sent > 0).unsqueeze(1), self.got), 1)
         arrives, acks = self.links(step, now).unbind(1)
         if self.config.delay:
@@ -154,22 +152,22 @@ class Exchange(nn.Module):
     def _fly(
         self, entry: Tensor, code: Tensor, step: Tensor, heard: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Sends entries with their codes; returns those that arrive from radios that are heard."""
+        """Sends entries; returns the arriving ones, as indices into `codes`, and their codes."""
         a_step, slots = self.shape[1] * self.shape[2], self.config.delay + 1
-        now, env = step % slots, entry // a_step
-        slot = torch.arange(slots, device=step.device)
-        self.flies[torch.arange(len(step), device=step.device), now] = False
-        sent = (env * (slots - 1) + now[env]) * a_step + entry
+        now, env = step % slots, torch.arange(len(step), device=step.device)
+        self.flies[env, now] = False
+        sent = entry + ((env * (slots - 1) + now) * a_step)[entry // a_step]
         self.flies.view(-1)[sent] = True
         self.codes.view(-1)[sent] = code
-        due = slot == (now.unsqueeze(-1) + 1) % slots  # the oldest one
-        sent = _marked(self.flies.flatten(0, 1), due.unsqueeze(-1) & heard.unsqueeze(1))
-        return sent // (slots * a_step) * a_step + sent % a_step, self.codes.view(-1)[sent]
+        rows = torch.zeros_like(self.flies[..., 0])
+        rows[env, (now + 1) % slots] = heard  # said `delay` steps before
+        sent = _marked(self.flies.flatten(0, 1), rows)
+        return sent, self.codes.view(-1)[sent]
 
     def _speak(
         self, known: Knowledge, step: Tensor, left: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the entries said and their codes, [k] each, and the bytes besides, [envs, r]."""
+        """Returns the entries said and their codes, [k] each, and the bytes, int64 [envs, r]."""
         radios, items = self.shape[1:]
         contact = _lately(self.heard, step.view(-1, 1, 1))
         met = (contact & ~self.contact).any(-1)
@@ -190,8 +188,9 @@ class Exchange(nn.Module):
         wanted = lacks.any(-1)
         self.pending.view(-1)[entry] = wanted
         says = (wanted & (told != mine)).nonzero().squeeze(-1)
+        size = self.sizes[entry % items]
         if left is not None:
-            size, waits = self.sizes[entry % items], self.waits.zero_().view(-1)
+            waits = self.waits.zero_().view(-1)
             waits.index_add_(0, row[says], size[says])
             says = says[(size <= left.view(-1)[row])[says]]
             expected = merged(theirs[says], told[says].unsqueeze(-1))
@@ -201,7 +200,8 @@ class Exchange(nn.Module):
         entry, mine = entry[says], mine[says]
         self.told.view(-1)[entry] = mine
         self.told_at.view(-1)[entry] = now[says]
-        return entry, mine, spent
+        sent = spent.view(-1).index_add(0, row[says], size[says]).view_as(spent)
+        return entry, mine, sent
 
     def _open(self, left: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Returns the bytes of headers and acknowledgements, and what is left, int64 [envs, r].
@@ -248,8 +248,8 @@ class Exchange(nn.Module):
         """
         radios, items = self.shape[1:]
         row, cell = entry // items, entry % items
-        env, speaker = row // radios, row % radios
-        which, hearer = arrives.mT.flatten(0, 1)[row].nonzero(as_tuple=True)
+        env, speaker = row // (radios * self.codes.shape[1]), row % radios
+        which, hearer = arrives.mT[env, speaker].nonzero(as_tuple=True)
         target = (env * radios * items + cell)[which] + hearer * items
         code, last, seen = code[which], known.last_seen, known.seen_fire
         changed = newer(code, codes(known, target))
