@@ -1,11 +1,10 @@
 """The Python API: trains, evaluates, loads and compares policies without printing."""
 
-import logging
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -219,7 +218,7 @@ def _finish(
     in_main_thread = threading.current_thread() is threading.main_thread()
     results: Results = {}
     try:
-        with stopping if in_main_thread else nullcontext(), _ONE_AT_A_TIME, _quiet():
+        with stopping if in_main_thread else nullcontext(), _ONE_AT_A_TIME:
             trainer.train(progress or (lambda _: None))
             stopping.at_once = True
             if stopping.received:
@@ -229,16 +228,3 @@ def _finish(
     finally:
         trainer.close()
     return Run(trainer.run.path, trainer.config, results)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Silences torchrl's messages below warnings, unless the user has set their level."""
-    logger = logging.getLogger("torchrl")
-    before = logger.level
-    if "RL_LOGGING_LEVEL" not in os.environ:
-        logger.setLevel(logging.WARNING)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)

@@ -1,5 +1,6 @@
 """Stores the UAVs' transitions, per UAV or shared by all (paper, sections IV.C and IV.D)."""
 
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,6 +16,8 @@ from emberlink.trainers.learners.tensors import flatten, group, prefixed, unflat
 
 DONE = (keys.AGENTS, "done")
 TERMINATED = (keys.AGENTS, "terminated")
+_SAID = "Initialized LazyTensorStorage"  # the Python functions print nothing
+logging.getLogger("torchrl").addFilter(lambda record: _SAID not in str(record.msg))
 
 
 class TeamReplay:
