@@ -204,6 +204,7 @@ def test_comparisons_and_replays_read_its_folder(source, capsys):
     assert trainers.evaluate(folders[0], episodes=2)["huygens"] == again["huygens"]
     assert main(["render", str(folders[0]), "--output", "replay.html"]) == 0
     assert "turner" in trainers.load(folders[0]).panel().title
+    adopted(folders[0], "independent", ["env.num_uavs=2"])
 
 
 def test_a_folder_that_names_code_inside_it_is_refused(tmp_path):

@@ -210,6 +210,8 @@ def foreign_policy(
     Raises:
         UserError: it is emberlink's, and does not fit the configuration.
     """
+    if isinstance(policy, TrainedPolicy) and isinstance(policy.decision, ForeignPolicy):
+        policy = policy.decision.policy  # of its folder
     spec = empty_env(config).observation_spec
     observed = keys.observation_keys(spec)
     if card := _card(policy):
