@@ -9,7 +9,15 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.cli.parser import between, command, command_group, path, positive, run_of
+from emberlink.trainers.cli.parser import (
+    between,
+    command,
+    command_group,
+    path,
+    positive,
+    run_name,
+    run_of,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -78,7 +86,7 @@ def add_eval(commands: Any) -> None:
     usage = "emberlink eval RUN | POLICY METHOD --name NAME [key=value ...]"
     add = command(commands, "eval", "evaluation.evaluate_run:run_command", text, usage=usage)
     run = "a run folder or pretrained:METHOD; or a policy: file.py:NAME, module:NAME or file.onnx"
-    add("folder", metavar="RUN | POLICY", help=run)
+    add("folder", metavar="RUN | POLICY", type=run_name, help=run)
     add(
         "overrides",
         help="keys of comm. or env. to change, such as env.radio.loss=0.5, world=NAME, or "
@@ -120,7 +128,7 @@ def add_compare(commands: Any) -> None:
     """
     add = command(commands, "compare", _compare, text)
     folders = "run folders, folders of run folders, or names such as pretrained:tuned"
-    add("folders", metavar="RUN", nargs="+", type=path, help=folders)
+    add("folders", metavar="RUN", nargs="+", type=lambda text: path(run_name(text)), help=folders)
     add("--output", metavar="FOLDER", type=path, help="a new folder (default: compare)")
     label = "name of the runs of the first RUN, of the second, and so on (default: their method)"
     add("--label", metavar="NAME", help=label, **_REPEATABLE)
@@ -163,6 +171,7 @@ def add_render(commands: Any) -> None:
         "runs",
         metavar="RUN",
         nargs="+",
+        type=run_name,
         help="a run folder, or pretrained:METHOD; after it KEY=VALUE, such as env.radio.range=0, "
         "for other settings of env and comm, or world=NAME",
     )
@@ -190,11 +199,19 @@ def add_sweep(commands: Any) -> None:
     emberlink sweep consensus positional setup=paper,tuned seed=0,1,2 output=runs
     """
     usage = "emberlink sweep [--dry-run] [METHOD ...] [key=value,value ...]"
-    add = command(commands, "sweep", "sweep.command:sweep", text, usage=usage)
+    add = command(commands, "sweep", _sweep, text, usage=usage)
     more = """methods (default: all); keys as for train, with one value or several;
     executor=local, submitit (SLURM) or ray, and its keys executor.KEY=value"""
     add("arguments", metavar="METHOD | key=value,value", nargs="+", help=more)
     add("--dry-run", action="store_true", help="only print the state of each run")
+
+
+def _sweep(options: argparse.Namespace, console: "Console") -> int:
+    from emberlink.envs.utils.config_files import find
+
+    for method in (text for text in options.arguments if "=" not in text):
+        find("method", method)
+    return run_of("sweep.command:sweep")(options, console)
 
 
 def add_tune(commands: Any) -> None:

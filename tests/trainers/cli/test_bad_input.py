@@ -52,12 +52,15 @@ def test_a_mistake_is_one_line_and_leaves_no_files(arguments, words, tmp_path, m
 
 @pytest.mark.parametrize(
     ("wrong", "seconds"),
-    [("nosuchmethod", 1), ("independent x=1", 2), ("independent learner.tau=fast", 2)],
+    [
+        *(("train nosuchmethod", 1), ("sweep nosuchmethod", 1), ("eval nowhere", 1)),
+        *(("train independent x=1", 2), ("train independent learner.tau=fast", 2)),
+    ],
 )
 def test_a_wrong_name_or_value_is_answered_without_torch(wrong, seconds):
     program = (
         "import sys, time; from emberlink.trainers.cli.main import main\n"
-        f"status = main({['train', *wrong.split()]})\n"
+        f"try: status = main({wrong.split()})\nexcept SystemExit as end: status = end.code\n"
         "assert 'torch' not in sys.modules; print(status, time.process_time())"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
