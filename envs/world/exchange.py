@@ -64,8 +64,8 @@ class Exchange(nn.Module):
     acknowledge a message of one (last), -1 for never"""
     codes: Tensor
     """int32 [envs, delay + 1, r, items]: the codes of the entries said at a step"""
-    flies: Tensor
-    """bool like `codes`: which entries are in flight"""
+    said_at: Tensor
+    """int32 like `codes`: the steps, -1 for never"""
     acknowledged: Tensor
     """bool [envs, r, r]: the messages of a radio (row) that others acknowledged at the last step"""
     waits: Tensor
@@ -101,14 +101,15 @@ class Exchange(nn.Module):
         self.register_buffer("told", nothing.repeat(self.shape))
         self.register_buffer("has", nothing.repeat(*self.shape, radios))
         self.register_buffer("codes", nothing.repeat(envs, config.delay + 1, radios, items))
-        self.register_buffer("flies", torch.zeros_like(self.codes, dtype=torch.bool))
+        self.register_buffer("said_at", torch.full_like(self.codes, -1))
         no = torch.tensor(False)
         self.links = Late(config.delay, envs, no, 2, radios, radios)
 
     def start_episodes(self, mask: Tensor) -> None:
         """Forgets everything in the environments of a mask, bool [envs]."""
         blank = {"pending": False, "contact": False, "got": False, "acknowledged": False}
-        blank |= {"heard": -1, "reached": -1, "told_at": -1, "told": _NOTHING, "has": _NOTHING}
+        blank |= dict.fromkeys(("heard", "reached", "told_at", "said_at"), -1)
+        blank |= {"told": _NOTHING, "has": _NOTHING}
         self.links.sent[mask] = False
         for name, value in blank.items():
             getattr(self, name)[mask] = value
@@ -153,15 +154,16 @@ class Exchange(nn.Module):
         self, entry: Tensor, code: Tensor, step: Tensor, heard: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Sends entries; returns the arriving ones, as indices into `codes`, and their codes."""
-        a_step, slots = self.shape[1] * self.shape[2], self.config.delay + 1
-        now, env = step % slots, torch.arange(len(step), device=step.device)
-        self.flies[env, now] = False
-        sent = entry + ((env * (slots - 1) + now) * a_step)[entry // a_step]
-        self.flies.view(-1)[sent] = True
+        (_, radios, items), slots = self.shape, self.config.delay + 1
+        env = entry // (radios * items)
+        sent = entry + ((slots - 1) * env + (step % slots)[env]) * radios * items
         self.codes.view(-1)[sent] = code
-        rows = torch.zeros_like(self.flies[..., 0])
-        rows[env, (now + 1) % slots] = heard  # said `delay` steps before
-        sent = _marked(self.flies.flatten(0, 1), rows)
+        self.said_at.view(-1)[sent] = step.int()[env]
+        env, radio = heard.nonzero(as_tuple=True)
+        row = (env * slots + ((step + 1) % slots)[env]) * radios + radio
+        then = (step - self.config.delay)[env].unsqueeze(-1)
+        which, cell = (self.said_at.view(-1, items)[row] == then).nonzero(as_tuple=True)
+        sent = row[which] * items + cell
         return sent, self.codes.view(-1)[sent]
 
     def _speak(
