@@ -182,8 +182,8 @@ class Exchange(nn.Module):
         told, at = self.told.view(-1)[entry], self.told_at.view(-1)[entry]
         due = (at == now - self.wait).nonzero().squeeze(-1)
         back = self.acknowledged.flatten(0, 1)[row[due]]
-        theirs[due] = merged(theirs[due], torch.where(back, told[due].unsqueeze(-1), _NOTHING))
-        self.has.view(-1, radios)[entry[due]] = theirs[due]
+        after = merged(theirs[due], torch.where(back, told[due].unsqueeze(-1), _NOTHING))
+        self.has.view(-1, radios)[entry[due]] = theirs[due] = after
         told = torch.where((at >= 0) & (now - at < self.wait), told, _NOTHING)
         spent, left = self._open(left)
         lacks = contact.flatten(0, 1)[row] & newer(mine.unsqueeze(-1), theirs)
