@@ -272,12 +272,12 @@ def test_an_onnx_file_acts_like_the_run(settings, tmp_path):
         **{**TINY, **settings},
     )
     policy, onnx = exported(run.path, tmp_path)
-    late = policy.config.env.radio.delay > 0
     check_same_actions(policy, onnx, 40)
     if settings.get("share_parameters"):
         other = trainers.load(run.path, num_uavs=5)
         check_same_actions(other, onnx, 20, num_envs=3)
-    for key, made in {"num_uavs": 3, "radio.delay": 7}.items() if late else ():
+    late = {"num_uavs": 3, "radio.delay": 7} if policy.config.env.radio.delay else {}
+    for key, made in late.items():
         with pytest.raises(UserError, match=f"policy.onnx: env.{key}=5; .* for env.{key}={made}"):
             adopted(str(tmp_path / "policy.onnx"), "independent", [f"env.{key}=5"])
     card = json.loads((tmp_path / "policy.json").read_text())

@@ -9,15 +9,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.cli.parser import (
-    between,
-    command,
-    command_group,
-    path,
-    positive,
-    run_name,
-    run_of,
-)
+from emberlink.trainers.cli.parser import between, command, command_group, path, positive, run_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,6 +23,13 @@ EXTRAS = {  # of `compare`, beside its page
 }
 _OVERRIDES: dict[str, Any] = {"metavar": "key=value", "nargs": "*", "default": []}
 _REPEATABLE: dict[str, Any] = {"action": "append", "default": []}
+
+
+def run_name(text: str) -> str:
+    """Checks that the folder of a run exists; a text with `:` or `=` names none."""
+    if not {":", "="} & {*text} and not path(text).exists():
+        raise argparse.ArgumentTypeError(f"{text}: there is no such run folder")
+    return text
 
 
 def add_train(commands: Any) -> None:

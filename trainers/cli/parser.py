@@ -110,10 +110,3 @@ def path(text: str) -> Path:
         return user_path(text)
     except UserError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def run_name(text: str) -> str:
-    """Checks that the folder of a run exists; a text with `:` or `=` names none."""
-    if not {":", "="} & {*text} and not path(text).exists():
-        raise argparse.ArgumentTypeError(f"{text}: there is no such run folder")
-    return text

@@ -77,9 +77,6 @@ def evaluate_run(
         fires: number of test fires, one episode each; `evaluation.episodes` if None.
         report: see `evaluate.evaluate`.
         label: suffix of the file names.
-
-    Raises:
-        UserError: the policy fails; if it is not of emberlink, eval.json has the scripted ones.
     """
     with naming(run.path / "figures"):
         run.figures()  # an unusable folder is an error before the episodes, not after

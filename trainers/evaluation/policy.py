@@ -205,11 +205,7 @@ def adopted(
 def foreign_policy(
     policy: Any, place: str, name: str, config: RunConfig, changes: Sequence[str] = ()
 ) -> TrainedPolicy:
-    """Returns a policy of any kind, which decides as often as `policy.hold` says.
-
-    Raises:
-        UserError: it is emberlink's, and does not fit the configuration.
-    """
+    """Returns a policy of any kind, if it fits, which decides as often as `policy.hold` says."""
     if isinstance(policy, TrainedPolicy) and isinstance(policy.decision, ForeignPolicy):
         policy = policy.decision.policy  # of its folder
     spec = empty_env(config).observation_spec

@@ -34,8 +34,7 @@ def tune(
     same command continues, in `output/tune_METHOD_SETUP_WORLD`.
 
     Args:
-        space: a file with the settings to try, besides those in `overrides`; the learner's file of
-            configs/space if None.
+        space: a file with the settings to try; the learner's file of configs/space if None.
         trials: number of trials, with the trials of earlier commands.
     """
     require("optuna", "tune", "tune")

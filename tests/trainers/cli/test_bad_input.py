@@ -30,7 +30,6 @@ COMMANDS = [
     ("train maps env.observation=vector", ["comm.name=maps exchanges the UAVs' maps"]),
     (f"{IMITATE} learner.teacher=courier", ["known: map_greedy"]),
     (f"train independent output={NOWHERE}", HOME),
-    (f"train independent world=file setup=tuned fire.path={NOWHERE}", HOME),
     (f"compare {NOWHERE}", HOME),
 ]
 
