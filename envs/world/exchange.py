@@ -162,8 +162,7 @@ class Exchange(nn.Module):
         env, radio = heard.nonzero(as_tuple=True)
         row = (env * slots + ((step + 1) % slots)[env]) * radios + radio
         then = (step - self.config.delay)[env].unsqueeze(-1)
-        which, cell = (self.said_at.view(-1, items)[row] == then).nonzero(as_tuple=True)
-        sent = row[which] * items + cell
+        sent = _marked(self.said_at.view(-1, items).index_select(0, row) == then, row)
         return sent, self.codes.view(-1)[sent]
 
     def _speak(
@@ -175,7 +174,8 @@ class Exchange(nn.Module):
         met = (contact & ~self.contact).any(-1)
         self.pending[met] = known.last_seen[met] >= 0
         self.contact.copy_(contact)
-        entry = _marked(self.pending, contact.any(-1))
+        row = contact.any(-1).view(-1).nonzero().squeeze(-1)
+        entry = _marked(self.pending.flatten(0, 1).index_select(0, row), row)
         row = entry // items
         mine, theirs = codes(known, entry), self.has.view(-1, radios)[entry]
         now = step[row // radios]
@@ -325,10 +325,9 @@ def merged(one: Tensor, other: Tensor) -> Tensor:
     return torch.maximum(one, other) | (one | other) & 1
 
 
-def _marked(pending: Tensor, rows: Tensor) -> Tensor:
-    """Returns the flat indices that are marked in rows, bool [envs, r], sorted."""
-    items, row = pending.shape[2], rows.view(-1).nonzero().squeeze(-1)
-    maps = pending.flatten(0, 1).index_select(0, row).flatten()
+def _marked(flags: Tensor, row: Tensor) -> Tensor:
+    """Returns the flat indices, sorted, of set flags [rows, items], which are rows of a table."""
+    maps, items = flags.flatten(), flags.shape[1]
     # Eight flags are read at a time, as most of them are not set.
     eights = nn.functional.pad(maps, (0, -len(maps) % 8)).view(-1, 8)
     some = eights.view(torch.int64).squeeze(-1).nonzero().squeeze(-1)
