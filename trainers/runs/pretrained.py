@@ -10,10 +10,13 @@ import shutil
 from fnmatch import fnmatch
 from importlib.resources import files
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from emberlink.envs.utils.errors import UserError, naming
-from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.runs.run_folder import NEWEST, RunFolder
+
+if TYPE_CHECKING:  # a wrong name is reported before torch is imported
+    from emberlink.trainers.config.schema import RunConfig
+    from emberlink.trainers.runs.run_folder import RunFolder
 
 PREFIX = "pretrained:"
 _COPY = "pretrained"
@@ -27,30 +30,33 @@ def is_name(text: str) -> bool:
     return text.startswith(PREFIX)
 
 
-def read_run(text: str) -> RunFolder:
+def read_run(text: str) -> "RunFolder":
     """Returns the run of a folder, or of `pretrained:[SETUP/]METHOD[/SEED]`, to be read.
 
     SETUP is such as `tuned` or, for the world front, `strong_front`.
     """
+    from emberlink.trainers.runs.run_folder import RunFolder
+
     return RunFolder(find_one(text) if is_name(text) else text)
 
 
-def open_run(text: str) -> RunFolder:
+def open_run(text: str) -> "RunFolder":
     """Returns the run of `read_run`, to be written to.
 
     A trained policy of the package is copied to a run folder in `runs`, unless there is a copy.
     """
+    run = read_run(text)
     if not is_name(text):
-        return RunFolder(text)
-    source = find_one(text)
-    run = RunFolder(Path("runs") / "_".join([_COPY, *source.parts[-3:]]))
+        return run
+    source = run.path
+    run = type(run)(Path("runs") / "_".join([_COPY, *source.parts[-3:]]))
     with naming(run.path):
         run.path.mkdir(parents=True, exist_ok=True)
         if not run.newest.exists():
             # The checkpoint last, and without modes: an installed package may be read-only.
-            for file in sorted(source.iterdir(), key=lambda file: file.name == NEWEST):
+            for file in sorted(source.iterdir(), key=lambda file: file.name == run.newest.name):
                 shutil.copyfile(file, run.path / file.name)
-        if run.newest.read_bytes() != (source / NEWEST).read_bytes():
+        if run.newest.read_bytes() != (source / run.newest.name).read_bytes():
             raise UserError(f"holds other networks than {text} of this version; move it away")
     return run
 
@@ -85,7 +91,7 @@ def find_one(text: str) -> Path:
     return policies[0]
 
 
-def collection(config: RunConfig) -> str:
+def collection(config: "RunConfig") -> str:
     """Returns the folder of a run's trained policies: its setup, and its world unless `paper`."""
     return config.setup if config.world == "paper" else f"{config.setup}_{config.world}"
 
