@@ -5,20 +5,15 @@ The driver follows from the first bytes, so that no text in a file can choose an
 """
 
 import hashlib
-import importlib
 import logging
 import re
-import struct
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from emberlink.envs.fire_files.report import ask
-from emberlink.envs.utils.errors import UserError, missing
+from emberlink.envs.utils.atomic_io import open_regular, user_path
+from emberlink.envs.utils.errors import UserError, printable, require
 
 MAX_BYTES = 150_000_000
 """Bytes of a text that is parsed whole."""
@@ -44,66 +39,62 @@ _GRID = "ForestGrid"  # begins the names of Cell2Fire's maps
 _SUFFIXES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".kmz", ".csv")
 _BESIDE = ".shx .dbf .prj .cpg -wal -journal .aux.xml .msk .ovr .aux .tfw .tifw .tiffw .wld .tab"
 """Endings of the files that the libraries open beside one."""
-
-
-def library(name: str, what: str = "reading this file") -> Any:
-    """Imports a module of the extra `geo`, which `what` needs."""
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise missing(name, "geo", what) from None
+for _name in ("rasterio", "pyogrio"):
+    logging.getLogger(_name).setLevel(logging.CRITICAL)  # damage is reported as an error instead
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
-    """Silences the warnings and logs of the libraries. Damage is reported as an error instead."""
-    before = logging.root.manager.disable
-    logging.disable(logging.CRITICAL)
+def naming_file(file: str, layer: str | None = None) -> Iterator[Path]:
+    """Gives the path of a file, and names it and its layer in errors."""
+    path = user_path(file)
+    place = f"{path}, layer {layer}" if layer else str(path)
     try:
-        with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
-            yield
-    finally:
-        logging.disable(before)
+        yield path
+    except UserError as error:
+        raise UserError(printable(f"{place}: {error}")) from None
+    except (OSError, MemoryError) as error:
+        why = getattr(error, "strerror", None) or "not enough memory"
+        raise UserError(printable(f"{place}: {why}")) from None
 
 
-def first_line(error: BaseException) -> str:
-    """Returns the first line of a library's message, at most 200 characters of it."""
-    error = error.__cause__ if error.__cause__ and "previous exception" in str(error) else error
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+@contextmanager
+def damage(expected: str) -> Iterator[None]:
+    """Turns the errors of libraries, which are of many types, into one line."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        hidden = error.__cause__ if "previous exception" in str(error) else None
+        lines = str(hidden or error).strip().splitlines() or [type(error).__name__]
+        raise ask(lines[0][:200], expected) from None
 
 
 def find_format(path: Path) -> str:
-    """Returns the format of a file or folder, and checks that it is safe and whole."""
+    """Returns the format of a file or folder, and checks that it is safe to open."""
     if path.is_dir():
         return "grids" if members(path)[0].name.startswith(_GRID) else "folder"
-    kind, head, size = _look(path)
-    if not kind:
-        seen = f"begins with {head[:16]!r}" if head else "is empty"
-        known = "GeoTIFF, NetCDF, ESRI ASCII, .npy, .shp, .gpkg, GeoJSON, KML, KMZ, CSV of points"
-        raise ask(seen, f"{known}, the paper's text")
-    if kind in ("csv", "kml", "points", "json") and size > MAX_BYTES:
+    kind = _format(path)
+    if kind in ("csv", "kml", "points", "json") and (size := path.stat().st_size) > MAX_BYTES:
         raise ask(f"{size} bytes", f"a text file of at most {MAX_BYTES}")
-    parts = {part.suffix.lower(): part for part in (path, *_beside(path))}
-    for suffix, part in parts.items():
-        form, head, size = _look(part)
+    for part in _beside(path):
         # GDAL opens masks and overviews in any format; some formats read other addresses.
-        if form != "tif" and suffix in (".msk", ".ovr"):
+        if part.suffix.lower() in (".msk", ".ovr") and _format(part) != "tif":
             raise ask(f"{part.name}, beside it, is no TIFF", "one, or no such file")
-        if size < (told := _declared(form or suffix, head.ljust(100, b"\0"))):
-            raise ask(f"{part.name} is damaged", f"{told} bytes or more")
-    if kind == "shp" and (missing := {".shx", ".dbf"} - {*parts}):
-        raise UserError(f"{path.stem}{min(missing)} is missing beside it")
+    for package in () if kind in ("npy", "points") else ("rasterio", "geopandas"):
+        require(package, "geo", path.name)
     return kind
 
 
-def _declared(kind: str, head: bytes) -> int:
-    """Returns the bytes that the header of a file declares; GDAL reads what is left of less."""
-    if kind == ".dbf":
-        records, start, row = struct.unpack("<IHH", head[4:12])
-        return start + records * row
-    if kind == "gpkg":
-        return int.from_bytes(head[16:18]) * int.from_bytes(head[28:32])
-    return 2 * int.from_bytes(head[24:28]) if kind == "shp" else 0  # and .shx
+def _format(path: Path) -> str:
+    """Returns the format of a regular file; a pipe, for example, would block for ever."""
+    with open_regular(path, 2**63) as file:
+        head = file.read(4096)
+    for kind, start in _HEADS.items():
+        if head and re.match(start, head):
+            return kind
+    known = "GeoTIFF, NetCDF, ESRI ASCII, .npy, .shp, .gpkg, GeoJSON, KML, KMZ, CSV of points"
+    raise ask(f"{path.name} begins with {head[:16]!r}", f"{known}, the paper's text")
 
 
 def _beside(path: Path) -> list[Path]:
@@ -126,19 +117,8 @@ def digest(path: Path) -> str:
     content = hashlib.sha256()
     for main in members(path) if path.is_dir() else [path]:
         for part in (main, *_beside(main)):
-            content.update(f"{part.name.removeprefix(path.stem)}:{_look(part)[2]}:".encode())
-            with part.open("rb") as file:
+            with open_regular(part, 2**63) as file:
+                size = part.stat().st_size
+                content.update(f"{part.name.removeprefix(path.stem)}:{size}:".encode())
                 hashlib.file_digest(file, lambda: content)
     return content.hexdigest()
-
-
-def _look(path: Path) -> tuple[str, bytes, int]:
-    """Returns the format, empty if none is known, the first bytes and the size of a file."""
-    if not path.exists():
-        raise UserError(f"{path.name}: there is no such file")
-    if not path.is_file():  # a pipe, for example, would block for ever
-        raise UserError(f"{path.name}: no regular file")
-    with path.open("rb") as file:
-        head = file.read(4096)
-    kind = next((k for k, start in _HEADS.items() if head and re.match(start, head)), "")
-    return kind, head, path.stat().st_size

@@ -12,11 +12,10 @@ import numpy as np
 from scipy.ndimage import binary_erosion, map_coordinates, minimum_filter, minimum_filter1d
 
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.files import first_line, library, members
-from emberlink.envs.fire_files.grid import Fire, Window
-from emberlink.envs.fire_files.plane import Bounds, Plane, choose_plane
-from emberlink.envs.fire_files.report import Clock, Report, ask, counted
-from emberlink.envs.fire_files.times import decided_unit, in_order, in_utc, parse_dates
+from emberlink.envs.fire_files.files import damage, members
+from emberlink.envs.fire_files.plane import Bounds, Plane, Window, choose_plane
+from emberlink.envs.fire_files.report import Clock, Report, ask
+from emberlink.envs.fire_files.times import decided_unit, in_order, parse_dates
 from emberlink.envs.utils.errors import UserError
 
 _MAX_CELLS = 50_000_000
@@ -34,15 +33,21 @@ _UNITS = {
 }
 _SIDE = 30  # cells along a side of the paper's map
 _SKIPPED = 6000  # lines of the paper's text before step 0
-_MAX_TIME = 1e12
+_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]])
 _NEVER = (-9999.0, -1.0)  # NODATA of FARSITE and FlamMap, and of ELMFIRE
 _VOID = 1e30  # a number beyond it is NODATA although not declared, such as -3.4e38
 
 
 @dataclass
-class Raster(Fire):
+class Raster:
     """A fire of arrival times in cells, [rows, columns], inf for never."""
 
+    clock: Clock
+    first: float
+    """time of the first arrival"""
+    last: float
+    whole: bool
+    """True for a map of the whole grid, which is neither cropped nor burnt out"""
     times: np.ndarray
     matrix: np.ndarray
     """affine, [3, 3]: x and y of a fractional column and row"""
@@ -57,8 +62,7 @@ class Raster(Fire):
             burnt = self.times <= until
             if burnt.sum() < 2:
                 raise UserError(f"until {self.clock.format(until)} no fire spreads: a single cell")
-            inner: Any = binary_erosion(burnt)
-            at = np.stack(np.nonzero(burnt & ~inner))
+            at = np.stack(np.nonzero(burnt & ~binary_erosion(burnt)))
             # Along each axis, the front has passed the centre by less than a cell.
             before = [minimum_filter1d(self.times, 3, axis)[*at] for axis in (0, 1)]
             left, passed = until - self.times[*at], self.times[*at] - before
@@ -67,7 +71,7 @@ class Raster(Fire):
         return float(x.min()), float(y.min()), float(x.max()), float(y.max())
 
     def on(self, window: Window, until: float, report: Report) -> np.ndarray:
-        """Interpolates bilinearly between burnt cells; the first cells of a fire are never lost.
+        """Interpolates bilinearly between burnt cells; returns the earliest, float64 [X, Y].
 
         A map of the whole grid, and a raster with the grid's cells, are not interpolated.
         """
@@ -86,25 +90,33 @@ class Raster(Fire):
         earliest = window.earliest(times)
         # Samples that are farther apart than the cells miss some of these.
         missed = np.abs(at[:, 1, 1] - at[:, 0, 0]).max() > 1 + 1e-6
-        rows, columns = np.nonzero(burns & (missed | (self.times == minimum_filter(self.times, 3))))
-        i, j, there = window.cells(*self._places(rows + 0.5, columns + 0.5))
-        np.minimum.at(earliest, (i[there], j[there]), self.times[rows[there], columns[there]])
+        burns &= missed | (self.times == minimum_filter(self.times, 3))
+        i, j, there = window.cells(*self._places(*(np.array(np.nonzero(burns)) + 0.5)))
+        np.minimum.at(earliest, (i[there], j[there]), self.times[burns][there])
         return earliest
 
     def _places(self, rows: Any, columns: Any) -> tuple[np.ndarray, np.ndarray]:
         """Returns x and y on the plane of fractional rows and columns."""
-        return self.plane.project(*_moved(self.matrix, columns, rows))
+        (a, b, c), (d, e, f), _ = self.matrix
+        x, y = a * columns + b * rows + c, d * columns + e * rows + f
+        return self.plane.project(x, y)
 
     def _cells(self, window: Window) -> np.ndarray:
         """Returns the rows and columns, 0 at the first centre, of a window's centres, [2, X, Y]."""
-        x, y = self.plane.project(*np.meshgrid(*window.axes(), indexing="ij"), back=True)
-        columns, rows = _moved(np.linalg.inv(self.matrix), x, y)
-        return np.nan_to_num(np.stack([rows, columns]) - 0.5, nan=-9, posinf=-9, neginf=-9)
+        x, y = self.plane.project(*window.centres(), back=True)
+        (a, b, c), (d, e, f), _ = np.linalg.inv(self.matrix)
+        at = np.stack([d * x + e * y + f, a * x + b * y + c]) - 0.5
+        return np.nan_to_num(at, nan=-9, posinf=-9, neginf=-9)
 
 
-def _moved(matrix: np.ndarray, x: Any, y: Any) -> tuple[Any, Any]:
-    (a, b, c), (d, e, f), _ = matrix
-    return a * x + b * y + c, d * x + e * y + f
+def as_fire(times: np.ndarray, clock: Clock, plane: Plane | None = None) -> Raster:
+    """Returns a fire of square cells, the first row in the north; without plane, a whole map."""
+    burning = times[np.isfinite(times)]
+    if len(burning) < 2:
+        raise ask(f"cells that burn: {len(burning)}", "arrival times of a fire that spreads")
+    north_up = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, len(times)], [0.0, 0.0, 1.0]])
+    ends, times = (float(burning.min()), float(burning.max())), times.astype(np.float64)
+    return Raster(clock, *ends, plane is None, times, north_up, plane or Plane(""))
 
 
 def read_raster(
@@ -116,10 +128,10 @@ def read_raster(
     if kind in ("npy", "grids"):
         maps, affine, crs = _array(path, kind), np.eye(3), None
         if config.kind != "masks":
-            return _bank(path, maps, config, horizon, report)
+            return _bank(maps, config, horizon, report)
         times, clock, what = _of_states(maps, config)
     else:
-        with _opened(path, kind, config.layer) as dataset:
+        with damage("a whole raster"), _opened(path, kind, config.layer) as dataset:
             affine, crs = np.reshape(dataset.transform, (3, 3)), dataset.crs
             if config.kind == "masks":
                 times, clock, what = _of_states(_read(dataset, MAX_BANK), config)
@@ -128,8 +140,6 @@ def read_raster(
     nowhere = Plane("no place in the file: square cells, the first row in the north")
     fire = as_fire(times, clock, nowhere)
     if crs is not None or not (np.allclose(affine, np.eye(3)) or np.allclose(affine, fire.matrix)):
-        if not 1e-20 < abs(np.linalg.det(affine)) < 1e12:
-            raise ask(f"cells of {affine[0, 0]:g} x {affine[1, 1]:g}", "a size above 0")
         fire.matrix = affine
         fire.plane = choose_plane(crs, config.crs, fire.bounds(None))
     begin, end = clock.format(fire.first), clock.format(fire.last)
@@ -141,22 +151,20 @@ def read_raster(
 @contextmanager
 def _opened(path: Path, kind: str, layer: str | None) -> Iterator[Any]:
     """Opens a raster by the driver of its name."""
-    rasterio = library("rasterio", "a raster")
+    import rasterio
+
     name: Any = path.absolute()
-    try:
-        if kind == "nc":
-            with rasterio.open(name, driver="netCDF") as dataset:
-                found = [part.rpartition(":")[2] for part in dataset.subdatasets]
-            if found and layer not in found:
-                some = "TIGN_G" if "TIGN_G" in found else found[0]
-                seen = f"{len(found)} variables: {', '.join(found[:30])}"
-                raise ask(seen, f"the one of arrival times, such as fire.layer={some}")
-            name = f'NETCDF:"{name}":{layer}' if found else name
-        more = {"DATATYPE": "Float64"} if kind == "asc" else {}
-        with rasterio.open(name, driver=_DRIVERS[kind], **more) as dataset:
-            yield dataset
-    except (rasterio.errors.RasterioError, OSError) as error:
-        raise ask(first_line(error), "a whole raster") from None
+    if kind == "nc":
+        with rasterio.open(name, driver="netCDF") as dataset:
+            found = [part.rpartition(":")[2] for part in dataset.subdatasets]
+        if found and layer not in found:
+            some = "TIGN_G" if "TIGN_G" in found else found[0]
+            seen = f"{len(found)} variables: {', '.join(found[:30])}"
+            raise ask(seen, f"the one of arrival times, such as fire.layer={some}")
+        name = f'NETCDF:"{name}":{layer}' if found else name
+    more = {"DATATYPE": "Float64"} if kind == "asc" else {}
+    with rasterio.open(name, driver=_DRIVERS[kind], **more) as dataset:
+        yield dataset
 
 
 def _read(dataset: Any, most: int, band: int | None = None) -> np.ndarray:
@@ -180,16 +188,15 @@ def _band(dataset: Any, last: bool, config: FileFireConfig) -> tuple[np.ndarray,
     what = f"band {next((title for title in titles if title), band)!r:.60}"
     what += f", the last of {band} times" if band > 1 else ""
     what += f" ({declared})" if declared else ""
-    values = _read(dataset, _MAX_CELLS, band)[0]
-    nodata = dataset.read_masks(band) == 0
-    values = values * dataset.scales[band - 1] + dataset.offsets[band - 1]
+    values = _read(dataset, _MAX_CELLS, band)[0] * dataset.scales[band - 1]
+    times = _arrival(values + dataset.offsets[band - 1], config, dataset.read_masks(band) == 0)
     name, _, since = declared.partition(" since ")
     known = next((u for u, form in _UNITS.items() if re.fullmatch(form, name, re.IGNORECASE)), None)
     if known == "no unit of time":
         raise ask(f"{what} is in {name[:20]}, {known}", "arrival times")
     unit = decided_unit(known, config, what)
-    origin = in_utc(parse_dates([since.strip()], None, "units")[0]) if since else None
-    return *in_order(_arrival(values, nodata, config), unit, config, origin), what
+    origin = parse_dates([since.strip()], None, "units")[0] if since else None
+    return *in_order(times, unit, config, origin), what
 
 
 def _of_states(maps: np.ndarray, config: FileFireConfig) -> tuple[np.ndarray, Clock, str]:
@@ -206,25 +213,13 @@ def _of_states(maps: np.ndarray, config: FileFireConfig) -> tuple[np.ndarray, Cl
     return *in_order(times, unit, config), what
 
 
-def as_fire(times: np.ndarray, clock: Clock, plane: Plane | None = None) -> Raster:
-    """Returns a fire of square cells, the first row in the north; without plane, a whole map."""
-    burning = times[np.isfinite(times)]
-    if len(burning) < 2:
-        raise ask(f"{counted(len(burning), 'cell')} burn", "arrival times of a fire that spreads")
-    north_up = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, len(times)], [0.0, 0.0, 1.0]])
-    ends, whole = (float(burning.min()), float(burning.max())), plane is None
-    return Raster(clock, *ends, whole, times.astype(np.float64), north_up, plane or Plane(""))
-
-
 def _array(path: Path, kind: str) -> np.ndarray:
     """Opens an array [fires, X, Y] or [X, Y] of arrival times, or [time, y, x] of states."""
-    try:
+    with damage("an array of NumPy, or maps of one size"):
         if kind == "grids":
             return np.stack([np.loadtxt(p, delimiter=",", ndmin=2) for p in members(path)])
         # Memory-mapped, so that a wrong header allocates nothing.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # a damaged header raises many types
-        raise ask(first_line(error), "an array of NumPy, or maps of one size") from None
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or array.dtype.kind not in "iufb" or not 0 < array.size <= MAX_BANK:
         seen = f"an array of {list(array.shape)}, {array.dtype}"
@@ -232,35 +227,24 @@ def _array(path: Path, kind: str) -> np.ndarray:
     return array
 
 
-def _bank(
-    path: Path, fires: np.ndarray, config: FileFireConfig, horizon: int, report: Report
-) -> list[Raster]:
+def _bank(fires: np.ndarray, config: FileFireConfig, horizon: int, report: Report) -> list[Raster]:
     """Returns fires in steps, [fires, X, Y], each a whole map."""
     count, columns, rows = fires.shape
     if config.never is None and np.isfinite(fires[:: max(1, count // 8)]).all():
         values, counts = np.unique(fires, return_counts=True)
         most = np.argsort(-counts, kind="stable")[:6]
         listed = ", ".join(f"{values[k]:g} ({counts[k] / fires.size:.0%})" for k in sorted(most))
-        keys = f"fire.unburned={values[most[0]]:g}", "fire.kind=masks", "fire.unburned=none"
-        states = slice(1, None) if len(values) <= 6 and (values % 1 == 0).all() else slice(None)
-        raise ask(f"{count} maps of the states {listed}, and no inf, never", *keys[states])
+        keys = [f"fire.unburned={values[most[0]]:g}", "fire.kind=masks", "fire.unburned=none"]
+        states = len(values) <= 6 and (values % 1 == 0).all()
+        raise ask(f"{count} maps of the states {listed}, and no inf, never", *keys[int(states) :])
     if config.units not in (None, "steps") and config.test is None:  # no other file has units
         raise ask(f"fire.units={config.units}: a bank is in steps", "none")
-    card = path.with_suffix(".json")
-    about = card.open(errors="replace").read(1_000_000) if card.is_file() else ""
-    written = re.search(r'"horizon": *(\d+)', about)
-    if config.start is config.end is None and written and int(written[1]) != horizon:
-        stretch = f"fire.end={written[1]} to stretch them over {horizon} steps"
-        seen = f"its fires are of {written[1]} steps, env.horizon is {horizon}"
-        raise ask(seen, f"env.horizon={written[1]}", stretch)
-    sources = []
-    for place, values in enumerate(fires):
-        try:
-            sources.append(as_fire(_arrival(values.T[::-1], None, config), Clock("steps")))
-        except UserError as error:
-            raise UserError(f"fire {place}: {error}") from None
-    report.facts.append(f"a bank of {counted(count, 'fire')} of {columns} x {rows} cells, in steps")
-    return sources
+    report.facts.append(f"a bank of {count} fires of {columns} x {rows} cells, in steps")
+    read = [as_fire(_arrival(values.T[::-1], config), Clock("steps")) for values in fires]
+    last = max(fire.last for fire in read)
+    if config.start is config.end is None and last > horizon:
+        report.doubts.append(f"fires burn until step {last:g}: fire.end={last:g} stretches them")
+    return read
 
 
 def _front_points(path: Path, config: FileFireConfig, report: Report) -> Raster:
@@ -270,22 +254,19 @@ def _front_points(path: Path, config: FileFireConfig, report: Report) -> Raster:
         for count, line in enumerate(lines, 1):
             if count <= _SKIPPED or not line.strip():
                 continue
-            try:
-                parts = line.strip().removesuffix(b",").split(b",")
-                points = np.array([float(part) for part in parts]).reshape(-1, 3)
-            except ValueError:
-                raise ask(f"line {count}: {line[:20]!r}", "x,y,intensity, of points") from None
-            cells = np.trunc(points[:, :2] - (_SIDE - 1) / 3).clip(-2, _SIDE + 1).astype(int) + 2
-            for i, j in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
-                x, y = (cells + np.array((i, j))).clip(0, _SIDE + 3).T
-                np.minimum.at(times, (x, y), float(count - 1 - _SKIPPED))
-    if count <= _SKIPPED:
-        raise ask(f"{count} lines", f"more than {_SKIPPED}, which are skipped")
+            with damage(f"x,y,intensity, of points in line {count}"):
+                values = [float(part) for part in line.strip().removesuffix(b",").split(b",")]
+                points = np.reshape(values, (-1, 3))[:, :2] - (_SIDE - 1) / 3
+            x, y = np.trunc(points).clip(-2, _SIDE + 1).astype(int).T + 2
+            np.minimum.at(times, (x, y), float(count - 1 - _SKIPPED))
     report.facts.append(f"the paper's text of {count} lines, a line per time")
-    return as_fire(times[2:-2, 2:-2].T[::-1], Clock(config.units or "steps"))
+    times = minimum_filter(times, footprint=_CROSS)[2:-2, 2:-2]
+    return as_fire(times.T[::-1], Clock(config.units or "steps"))
 
 
-def _arrival(values: np.ndarray, nodata: np.ndarray | None, config: FileFireConfig) -> np.ndarray:
+def _arrival(
+    values: np.ndarray, config: FileFireConfig, nodata: np.ndarray | None = None
+) -> np.ndarray:
     """Returns arrival times, inf in cells that never burn; asks about values that may be no times.
 
     `nodata` is the file's mask; a bank has none: inf says there what never burns.
@@ -293,38 +274,37 @@ def _arrival(values: np.ndarray, nodata: np.ndarray | None, config: FileFireConf
     times = np.array(values, np.result_type(values, np.float32))
     void = ~(np.abs(times) <= _VOID) | np.isin(times, (*_NEVER, *(config.never or ())))
     times[void | (False if nodata is None else nodata)] = np.inf
-    told = times[np.isfinite(times)]
-    wrong = (times < 0) | ((times > _MAX_TIME) & (times < np.inf))
-    asked = np.unique(times[wrong])[:5].tolist()
+    told, counts = np.unique(times[np.isfinite(times)], return_counts=True)
+    odd = told < 0
     if config.never is None and nodata is not None:
-        asked += _plateaus(np.where(wrong, np.inf, times))
-    if asked:
-        shares = (f"{value:g} ({(told == value).mean():.0%} of the cells)" for value in asked)
-        some = ",".join(f"{value:g}" for value in asked)
+        odd |= _plateaus(times, told, counts)
+    if odd.any():
+        asked = [f"{value:g}" for value in told[odd][:6]]
+        shares = zip(asked, counts[odd] / counts.sum(), strict=False)
+        listed = " and ".join(f"{value} ({share:.0%} of the cells)" for value, share in shares)
+        others = f"{told[~odd].min():g} to {told[~odd].max():g}" if not odd.all() else "none"
+        seen = f"{listed} may stand for cells that do not burn (others: {others})"
+        some = ",".join(asked)
         key = f"'fire.unburned=[{some}]'" if len(asked) > 1 else f"fire.unburned={some}"
-        others = times[np.isfinite(times) & ~np.isin(times, asked)]
-        between = f"{others.min():g} to {others.max():g}" if len(others) else "none"
-        seen = f"{' and '.join(shares)} may stand for cells that do not burn (others: {between})"
-        raise ask(seen, key, *([] if wrong.any() else ["fire.unburned=none if they burn then"]))
+        none = () if (told < 0).any() else ("fire.unburned=none if they burn then",)
+        raise ask(seen, key, *none)
     return times
 
 
-def _plateaus(times: np.ndarray) -> list[float]:
-    """Returns values that may stand for cells that do not burn.
+def _plateaus(times: np.ndarray, told: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Returns which values of 0 or more may stand for cells that do not burn.
 
     They hold more than half of the cells; or are the first or last value, and far from the rest or
     frequent along the edge of the raster, where a fire has cells of many times.
     """
-    finite = np.isfinite(times)
-    values, counts = np.unique(times[finite], return_counts=True)
-    cells = counts.sum()
-    odd = {int(i) for i in np.flatnonzero(counts > 0.5 * cells)} if len(values) > 1 else set()
-    edge = times[finite & ~binary_erosion(finite)]  # pyright: ignore
-    for end, rest in ((0, slice(1, None)), (-1, slice(0, -1))):
-        others = values[rest]
-        if len(others) > 2:
-            far = abs(values[end] - others[end]) > others[-1] - others[0]
-            often = counts[end] > max(0.1 * cells, 3 * counts[rest].max())
-            if far or (often and (edge == values[end]).mean() > 0.5):
-                odd.add(end % len(values))
-    return [float(values[i]) for i in sorted(odd)]
+    times, counts = np.where(times < 0, np.inf, times), np.where(told < 0, 0, counts)
+    held = np.flatnonzero(counts)
+    odd = (counts > counts.sum() / 2) & (len(held) > 1)
+    if len(held) > 3:
+        edge = times[np.isfinite(times) & ~binary_erosion(np.isfinite(times))]
+        for at, (first, last) in ((held[0], held[[1, -1]]), (held[-1], held[[-2, 0]])):
+            far = abs(told[at] - told[first]) > abs(told[last] - told[first])
+            rest = np.delete(counts, at).max()
+            often = counts[at] > max(0.1 * counts.sum(), 3 * rest)
+            odd[at] |= far or (often and (edge == told[at]).mean() > 0.5)
+    return odd

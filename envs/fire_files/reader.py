@@ -3,8 +3,7 @@
 import dataclasses
 import json
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,16 +12,14 @@ import torch
 from torch import Tensor
 
 from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
-from emberlink.envs.fire_files.files import TABLES, digest, find_format, quiet
+from emberlink.envs.fire_files.files import TABLES, digest, find_format, naming_file
 from emberlink.envs.fire_files.grid import on_grid
-from emberlink.envs.fire_files.perimeters import read_perimeters
 from emberlink.envs.fire_files.rasters import MAX_BANK, read_raster
 from emberlink.envs.fire_files.report import Report, ask
-from emberlink.envs.fire_files.tables import read_table
-from emberlink.envs.utils.atomic_io import open_regular, replaced, user_path
+from emberlink.envs.utils.atomic_io import open_regular, replaced
 from emberlink.envs.utils.errors import UserError, naming, printable
 
-READER_VERSION = 12  # increase it if the same file gives another grid
+READER_VERSION = 13  # increase it if the same file gives another grid
 _OF_TABLES = ("time_field", "time_format", "incident", "incident_field", "where", "radius")
 
 
@@ -34,14 +31,21 @@ def read_with_summary(
     The fires are float32 [fires, X, Y], in steps; inf never burns.
     """
     report = Report()
-    with _named(config.path, config.layer) as path, quiet():
+    with (
+        naming_file(config.path, config.layer) as path,
+        warnings.catch_warnings(action="ignore"),
+        np.errstate(all="ignore"),
+    ):
         kind = find_format(path)
-        if kind in TABLES and (config.kind == "masks" or config.unburned is not None):
-            raise ask("fire.kind=masks and fire.unburned are for rasters", "none")
-        if kind in TABLES:
-            sources = [read_perimeters(read_table(path, kind, config), config, report)]
-        elif given := [key for key in _OF_TABLES if getattr(config, key) is not None]:
-            raise ask(f"fire.{given[0]} chooses among perimeters", "none for a raster")
+        table = kind in TABLES
+        for key in ("unburned",) if table else _OF_TABLES:
+            if getattr(config, key) is not None or (table and config.kind == "masks"):
+                others = "rasters" if table else "perimeters"
+                raise ask(f"fire.{key} or fire.kind is of {others}", "none for this file")
+        if table:
+            from emberlink.envs.fire_files.perimeters import read_perimeters
+
+            sources = [read_perimeters(path, kind, config, report)]
         else:
             sources = read_raster(path, kind, config, horizon, report)
         try:
@@ -55,20 +59,6 @@ def read_with_summary(
     if doubts:
         warnings.warn(f"{printable(str(path))}: {doubts}; read: {summary}", stacklevel=3)
     return torch.from_numpy(np.stack(fires)), summary
-
-
-@contextmanager
-def _named(file: str, layer: str | None = None) -> Iterator[Path]:
-    """Gives the path of a file, and names it and its layer in errors."""
-    path = user_path(file)
-    try:
-        yield path
-    except (UserError, OSError, MemoryError) as error:
-        text = str(error).removeprefix(f"{path.name}: ")
-        if not isinstance(error, UserError):
-            text = f"cannot be read: {getattr(error, 'strerror', None) or 'not enough memory'}"
-        place = f"{path}, layer {layer}" if layer else str(path)
-        raise UserError(printable(f"{place}: {text}")) from None
 
 
 class FireSets(NamedTuple):
@@ -107,14 +97,15 @@ def _divide(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[
 
 def with_checksum(config: FileFireConfig) -> FileFireConfig:
     """Computes the checksums of the files and returns the scenario with them."""
-    sums: list[str | None] = []
-    for file, known in ((config.path, config.sha256), (config.test, config.test_sha256)):
-        with _named(file or "") as path:
-            sums.append(file and digest(path))
-            if known not in (None, sums[-1]):
-                here, there = str(sums[-1])[:12], str(known)[:12]
-                raise UserError(f"has changed: its SHA-256 is {here}..., in the run {there}...")
-    return dataclasses.replace(config, sha256=sums[0], test_sha256=sums[1])
+    sums: dict[str, str] = {}
+    for key, file in (("sha256", config.path), ("test_sha256", config.test)):
+        if file is not None:
+            with naming_file(file) as path:
+                sums[key], known = digest(path), getattr(config, key)
+                if known not in (None, sums[key]):
+                    now = f"its SHA-256 is {sums[key][:12]}..., in the run {known[:12]}..."
+                    raise UserError(f"has changed: {now}")
+    return dataclasses.replace(config, **sums)
 
 
 def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: int) -> None:

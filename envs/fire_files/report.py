@@ -32,12 +32,16 @@ class Clock:
         date = self.origin + timedelta(seconds=time * SECONDS[self.unit])
         return date.isoformat(timespec="minutes")
 
+    def beginning(self, first: float, last: float) -> float:
+        """Returns when a fire began: elapsed times are counted from there; asks if unsure."""
+        if self.origin is not None or self.unit not in ("seconds", "minutes", "hours", "days"):
+            return first
+        if first > last - first > 0:
+            seen = f"times from {self.format(first)} to {self.format(last)}"
+            raise ask(seen, "fire.start=0 if it began at 0", f"fire.start={first:g} if then")
+        return 0.0
+
 
 def ask(seen: str, *answers: str) -> UserError:
     """Returns a question: what was seen, and what is expected, such as the keys that decide."""
     return UserError(f"{seen}; expected {', or '.join(answers)}")
-
-
-def counted(number: int, noun: str) -> str:
-    """Returns a number with its noun."""
-    return f"{number} {noun}{'s' * (number != 1)}"

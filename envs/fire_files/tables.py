@@ -6,7 +6,6 @@ attributes as texts, empty where they are missing.
 
 import gc
 import io
-import json
 import re
 import zipfile
 from collections.abc import Iterator
@@ -15,140 +14,132 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+import orjson
+import pandas
+import pyogrio
+from geopandas import GeoDataFrame, points_from_xy
 
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.files import MAX_BYTES, find_format, first_line, library, members
-from emberlink.envs.fire_files.plane import parse_crs
+from emberlink.envs.fire_files.files import MAX_BYTES, damage, find_format, members
 from emberlink.envs.fire_files.report import ask
+from emberlink.envs.fire_files.times import FOLDERS, column_named, plain
 from emberlink.envs.utils.errors import UserError, unknown
 from emberlink.envs.utils.validation import as_argument
 
-FOLDERS = " > "
-"""Between the names of folders, one within the other."""
 _SHAPES = ("Point", "LineString", "Polygon", "MultiGeometry")
 _DEGREES = "EPSG:4326"
-_MAYBE = r"name|id|num|number|label|(f|fire|ig|ignition|event)?(year|yr)"
-_IDENTIFIER = re.compile(
+_MAYBE_ID = r"name|id|num|number|label|(f|fire|ig|ignition|event)?(year|yr)"
+_ID = (
     r"(poly|attr)?(incident|incid|fire|event|burn|complex|cluster|merged?)s?"
-    rf"(name|nm|id|num|number|no|nr|code)?|fname|.*irwin.*|.*uniquefire.*|{_MAYBE}"
+    r"(name|nm|id|num|number|no|nr|code)?|fname|.*irwin.*|.*uniquefire.*"
 )
-"""Columns that identify a fire, or maybe the features or times, by the letters of their names."""
-_CATEGORY = re.compile(r".*(category|class|kind|type|status)|(poly)?featu\w*|incidentty|type.*")
+"""Columns that identify a fire, by the letters of their names, or maybe features or times."""
+_MAYBE_KIND = r".*(class|kind|type|status)|type.*"
+_KIND = r".*categ.*|(poly)?featu\w*"
+"""Columns of kinds of features, or maybe descriptions of each."""
 
 
-def read_table(path: Path, kind: str, config: FileFireConfig) -> tuple[Any, list[str]]:
-    """Returns the features of a file or folder, and the columns that stand outside of them.
-
-    The index names the features in messages. Columns outside the attributes may hold a date.
-    """
+def read_table(path: Path, kind: str, layer: str | None) -> tuple[Any, Any]:
+    """Returns attributes and shapes of the features of a file or folder, indexed by their names."""
     if kind != "folder":
-        return _of_file(path, kind, config.layer)
-    frames, outside = [], {"File": None}
-    for part in members(path):
-        try:
-            frame, others = _of_file(part, find_format(part), config.layer)
-            if frames and (frame.crs is None) != (frames[0].crs is None):
-                raise ask("with and without projection", "one in each file")
-        except UserError as error:
-            raise UserError(f"{part.name}: {error}") from None
-        frame = frame.rename(index=f"{part.name}: {{}}".format).assign(File=part.stem)
-        frames.append(frame.to_crs(frames[0].crs if frames else frame.crs))
-        outside |= dict.fromkeys(others)
-    whole = library("pandas").concat(frames)
-    return whole.fillna(dict.fromkeys(attributes(whole), "")), list(outside)
+        frame = _of_file(path, kind, layer)
+    else:
+        frames = [
+            _of_file(part, find_format(part), layer)
+            .assign(File=part.stem)
+            .rename(index=f"{part.name}: {{}}".format)
+            for part in members(path)
+        ]
+        with damage("the same projection, or none, in each file"):
+            frame = pandas.concat([part.to_crs(frames[0].crs) for part in frames])
+    return frame.drop(columns="geometry").fillna(""), frame.geometry
 
 
-def _of_file(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
+def _of_file(path: Path, kind: str, layer: str | None) -> Any:
     readers = {"json": _geojson, "kml": _kml, "kmz": _kml, "csv": _csv}
-    library("geopandas")
     gc.disable()  # it takes two thirds of the time to parse a large text
     try:
-        frame, outside = readers.get(kind, _by_gdal)(path, layer)
-        if not hasattr(frame, "geometry") or len(frame) == 0:
-            raise ask("no feature with a geometry", "perimeters")
-    except UserError:
-        raise
-    except Exception as error:  # GDAL, text and geometries raise many types
-        raise ask(first_line(error), "perimeters") from None
+        with damage(f"perimeters in {path.name}"):
+            frame = readers.get(kind, _by_gdal)(path, layer)
+            shapes = frame.geometry.reset_index(drop=True)
     finally:
         gc.enable()
-    frame = frame.assign(**{name: _texts(frame[name]) for name in attributes(frame)})
-    return frame.reset_index(drop=True).rename(index="feature {}".format), outside
+    table = frame.drop(columns=frame.geometry.name).reset_index(drop=True).apply(_texts)
+    return GeoDataFrame(table, geometry=shapes).rename(index="feature {}".format)
 
 
-def _csv(path: Path, _: str | None) -> tuple[Any, list[str]]:
-    table = library("pandas").read_csv(path, dtype=str, skipinitialspace=True)
+def _texts(column: Any) -> Any:
+    """Returns the values of a column as texts; missing values are empty."""
+    texts = column.astype(str).str.strip().str.removesuffix(".0")
+    return texts.where(column.notna(), "")
+
+
+def _csv(path: Path, _: str | None) -> Any:
+    table = pandas.read_csv(path, dtype=str, skipinitialspace=True)
     at = {str(name).lower(): table[name] for name in table.columns}
-    points = library("geopandas").points_from_xy(at["longitude"], at["latitude"])
-    return library("geopandas").GeoDataFrame(table, geometry=points, crs=_DEGREES), []
+    points = points_from_xy(at["longitude"], at["latitude"])
+    return GeoDataFrame(table, geometry=points, crs=_DEGREES)
 
 
-def _by_gdal(path: Path, wanted: str | None) -> tuple[Any, list[str]]:
+def _by_gdal(path: Path, wanted: str | None) -> Any:
     """Reads the layer `wanted`, or the only layer with geometries."""
-    pyogrio = library("pyogrio")
     path = path.absolute()
     names = [str(name) for name, kind in pyogrio.list_layers(path) if kind is not None]
     if wanted not in names and (wanted or len(names) != 1):
         keys = [as_argument("fire.layer", name) for name in names[:30]]
         raise ask(f"{len(names)} layers of perimeters", *keys)
-    return pyogrio.read_dataframe(path, layer=wanted or names[0], datetime_as_string=True), []
+    return pyogrio.read_dataframe(path, layer=wanted or names[0], datetime_as_string=True)
 
 
-def _geojson(path: Path, _: str | None) -> tuple[Any, list[str]]:
+def _geojson(path: Path, _: str | None) -> Any:
     """Reads GeoJSON; texts and numbers beside the features become columns, such as `valid_at`."""
-    whole = json.loads(path.read_bytes())
-    features = [whole] if whole.get("type") == "Feature" else whole.get("features")
-    if whole.get("type") not in ("Feature", "FeatureCollection") or not isinstance(features, list):
-        raise ask(f"type {str(whole.get('type'))[:40]!r}", "a FeatureCollection")
+    whole = orjson.loads(path.read_bytes())
+    features = [whole] if whole.get("type") == "Feature" else whole["features"]
     crs: Any = _DEGREES
     if given := whole.get("crs"):
         if given.get("type") != "name":
             raise ask("its crs is a link, which is not followed", "a name, or none")
-        crs = parse_crs(given["properties"]["name"])
+        crs = given["properties"]["name"]
     for shape in (feature.get("geometry") or {} for feature in features):
         if shape.get("type") == "Polygon":  # shapely reads arrays twice as fast
             shape["coordinates"] = [np.array(ring) for ring in shape["coordinates"]]
-    frame = library("geopandas").GeoDataFrame.from_features(features, crs=crs)
+    frame: Any = GeoDataFrame.from_features(features, crs=crs)
     if crs == _DEGREES and abs(frame.total_bounds).max() > 360:
         frame = frame.set_crs(None, allow_override=True)  # not as GeoJSON is defined
     about = {**whole, **(whole.get("properties") or {}), **(whole.get("metadata") or {})}
     taken = ("type", "name", *frame.columns)
-    about = {k: v for k, v in about.items() if isinstance(v, str | int) and k not in taken}
-    return frame.assign(**about), list(about)
+    more = {k: v for k, v in about.items() if isinstance(v, str | int) and k not in taken}
+    return frame.assign(**more)
 
 
-def _kml(path: Path, layer: str | None) -> tuple[Any, list[str]]:
+def _kml(path: Path, _: str | None) -> Any:
     """Returns the placemarks of KML or KMZ; GDAL gets their geometries alone."""
-    rows, marks, contents = [], ElementTree.Element("Document"), [path.read_bytes()]
+    contents = [path.read_bytes()]
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             parts = [part for part in archive.infolist() if part.filename.lower().endswith(".kml")]
             if sum(part.file_size for part in parts) > MAX_BYTES:
                 raise ask("its .kml is too large", f"{MAX_BYTES} bytes at most")
             contents = [archive.read(part) for part in parts]
+    rows, marks = [], ElementTree.Element("Document")
     for content in contents:
         if b"\0" in content[:1000] or re.search(rb"<!(DOCTYPE|ENTITY)", content, re.IGNORECASE):
             raise ask("a document type declaration or UTF-16", "plain KML")
         root = ElementTree.fromstring(content)
         for element in root.iter():
             element.tag = str(element.tag).rpartition("}")[2]
-        for row, element in _placemarks(root):
-            if layer is None or layer in str(row["Folder"]).split(FOLDERS):
-                rows.append(row)
-                shapes = [part for part in element if part.tag in _SHAPES]
-                ElementTree.SubElement(marks, "Placemark").extend(shapes)
-    if not rows:
-        raise ask("no placemark", "KML with perimeters")
+        for row, shapes in _placemarks(root):
+            rows.append(row)
+            ElementTree.SubElement(marks, "Placemark").extend(shapes)
     text = b"<kml>" + ElementTree.tostring(marks) + b"</kml>"
-    shapes = library("pyogrio").read_dataframe(io.BytesIO(text), columns=[]).geometry
-    frame = library("geopandas").GeoDataFrame(rows, geometry=shapes, crs=_DEGREES)
-    return frame, ["Name", "Folder"]
+    shapes = pyogrio.read_dataframe(io.BytesIO(text), columns=[]).geometry
+    return GeoDataFrame(rows, geometry=shapes, crs=_DEGREES)
 
 
 def _placemarks(
     element: Any, folders: tuple[str, ...] = (), time: str | None = None
-) -> Iterator[tuple[dict[str, str | None], Any]]:
-    """Yields each placemark and its attributes; a folder's time holds for its contents."""
+) -> Iterator[tuple[dict[str, str | None], list[Any]]]:
+    """Yields attributes and shapes of each placemark; a folder's time holds for its contents."""
     for part in (*element.findall("TimeStamp"), *element.findall("TimeSpan")):
         time = part.findtext("when") or part.findtext("begin") or time
     if element.tag != "Placemark":
@@ -164,99 +155,73 @@ def _placemarks(
     for part in (element, *element.iter("MultiGeometry")):
         for ring in part.findall("LinearRing"):  # which is no geometry of its own for shapely
             ring.tag = "LineString"
-    yield row, element
+    yield row, [part for part in element if part.tag in _SHAPES]
 
 
-def plain(name: Any) -> str:
-    """Returns the letters and digits of a column's name, in lower case."""
-    return re.sub(r"[\W_]", "", str(name).lower())
-
-
-def _texts(column: Any) -> Any:
-    """Returns the values of a column as texts; missing values are empty."""
-    written = column.astype(str).fillna("")
-    read = {text: re.sub(r"\.0$", "", text).strip() for text in written.unique()}
-    return written.map(read).where(column.notna(), "")
-
-
-def attributes(frame: Any) -> list[Any]:
-    """Returns the columns of a table except its geometry."""
-    return [name for name in frame.columns if name != frame.geometry.name]
-
-
-def column_named(name: str, frame: Any, key: str) -> Any:
-    """Returns the column with a name in any case."""
-    columns = attributes(frame)
-    for column in columns:
-        if str(column).lower() == name.strip().lower():
-            return column
-    known = ", ".join(map(str, columns[:30])) or "none"
-    raise UserError(f"no column {name.strip()!r} ({key}); there are {known}")
-
-
-def choose_features(frame: Any, config: FileFireConfig, facts: list[str]) -> Any:
+def choose_features(table: Any, config: FileFireConfig, facts: list[str]) -> Any:
     """Returns the features of one fire; notes on the others are appended to `facts`."""
     for key, choose in (("where", _where), ("incident", _of_incident)):
-        kept = choose(frame, config)
-        if left_out := len(frame) - len(kept):
+        kept = choose(table, config)
+        if left_out := len(table) - len(kept):
             facts.append(f"{left_out} left out by fire.{key}={getattr(config, key)}")
-        frame = kept
-    return frame
+        table = kept
+    return table
 
 
-def _where(frame: Any, config: FileFireConfig) -> Any:
-    """Returns the features that `fire.where` keeps; asks if a category has several values."""
-    if config.where is None:
-        known = [name for name in attributes(frame) if _CATEGORY.fullmatch(plain(name))]
-        for column in _several(frame, known, "categ|featu"):
-            choice = as_argument("fire.where", f"{column}={frame[column].mode().iloc[0]}")
-            seen = f"features of several kinds: {_counts(frame, column)}"
-            raise ask(seen, choice, "fire.where=* for all of them")
+def _where(table: Any, config: FileFireConfig) -> Any:
+    """Returns the features that `fire.where` keeps; asks if there are several kinds."""
+    if config.where is None and (several := _several(table, _KIND, _MAYBE_KIND)):
+        choice = as_argument("fire.where", f"{several[0]}={table[several[0]].mode().iloc[0]}")
+        seen = f"features of several kinds: {_counts(table, several[:1])}"
+        raise ask(seen, choice, "fire.where=* for all of them")
     if config.where in (None, "*"):
-        return frame
+        return table
     name, equals, pattern = config.where.partition("=")
-    values = frame[column := column_named(name, frame, "fire.where")]
-    escaped = re.escape(pattern.strip()).replace(r"\*", ".*").replace(r"\|", "|")
-    keeps = values.str.fullmatch(escaped, case=False) if equals else values != ""
-    if not keeps.any():
-        raise ask(f"fire.where={config.where} keeps no feature", _counts(frame, column))
-    return frame[keeps]
+    values = table[name := column_named(name, table, "fire.where")]
+    form = re.escape(pattern.strip()).replace(r"\*", ".*").replace(r"\|", "|")
+    kept = table[values.str.fullmatch(form, case=False) if equals else values != ""]
+    if kept.empty:
+        raise ask(f"fire.where={config.where} keeps no feature", _counts(table, [name]))
+    return kept
 
 
-def _of_incident(frame: Any, config: FileFireConfig) -> Any:
+def _of_incident(table: Any, config: FileFireConfig) -> Any:
     """Returns the features of `fire.incident`; asks if identifiers differ."""
     wanted, field = config.incident, config.incident_field
-    known = [name for name in attributes(frame) if _IDENTIFIER.fullmatch(plain(name))]
-    places = known if field is None else [column_named(field, frame, "fire.incident_field")]
     if wanted == "*":
-        return frame
+        return table
     other = "fire.incident=* for all as one fire"
     if wanted is not None:
-        is_it = {at: frame[at].str.lower() == str(wanted).strip().lower() for at in places}
-        if not (found := [at for at in places if is_it[at].any()]):
-            values = {text for at in places for text in frame[at] if text}
-            raise UserError(f"fire.incident={unknown(str(wanted), sorted(values)[:30])}")
-        frame = frame[is_it[found[0]]]
-        if field is not None:
-            return frame
-        other = f"fire.incident_field={found[0]} beside fire.incident for all of these"
-    if several := _several(frame, places, f"^(?!({_MAYBE})$)"):
-        answer = as_argument("fire.incident", next(filter(None, frame[several[0]])))
-        listed = "; ".join(_counts(frame, name) for name in several)
-        seen = f"{len(frame)} features of several fires: {listed}"
+        known = [name for name in table if re.fullmatch(f"{_ID}|{_MAYBE_ID}", plain(name))]
+        places = known if field is None else [column_named(field, table, "fire.incident_field")]
+        is_it = table[places].apply(lambda column: column.str.lower() == str(wanted).lower())
+        if not is_it.any(axis=None):
+            values = sorted({*table[places].to_numpy().flat} - {""})[:30]
+            raise UserError(f"fire.incident={unknown(str(wanted), values)}")
+        table = table[is_it[chosen := is_it.any().idxmax()]]
+        other = f"fire.incident_field={chosen} beside fire.incident for all of these"
+    if (several := _several(table, _ID, _MAYBE_ID)) and not (wanted and field):
+        answer = as_argument("fire.incident", next(filter(None, table[several[0]])))
+        seen = f"{len(table)} features of several fires: {_counts(table, several)}"
         raise ask(seen, f"fire.incident_field={several[0]} {answer}", other)
-    return frame
+    return table
 
 
-def _several(frame: Any, columns: list[Any], sure: str) -> list[Any]:
-    """Returns the columns with several values; of unsure ones, not one for each feature."""
-    counts = {name: frame[name].replace("", None).nunique() for name in columns}
-    every = {name: len(frame) + bool(re.search(sure, plain(name))) for name in columns}
-    return [name for name in columns if 1 < counts[name] < every[name]]
+def _several(table: Any, sure: str, maybe: str) -> list[Any]:
+    """Returns the columns with several values; of columns that are unsure, not one per feature."""
+    return [
+        name
+        for name, count in table.replace("", None).nunique().items()
+        if (count > 1 and re.fullmatch(sure, plain(name)))
+        or (1 < count < len(table) and re.fullmatch(maybe, plain(name)))
+    ]
 
 
-def _counts(frame: Any, column: Any) -> str:
-    """Returns the values of a column with the number of features of each."""
-    counts = frame[column].value_counts()
-    shown = [f"{value or '(none)'} ({count})" for value, count in counts.head(12).items()]
-    return f"{column}: {', '.join(shown)}{', ...' if len(counts) > 12 else ''}"
+def _counts(table: Any, names: list[Any]) -> str:
+    """Returns the values of columns with the number of features of each."""
+    listed = []
+    for name in names:
+        counts = table[name].value_counts()
+        shown = [f"{value or '(none)'} ({count})" for value, count in counts.head(12).items()]
+        listed.append(f"{name}: {', '.join(shown)}{', ...' if len(counts) > 12 else ''}")
+    return "; ".join(listed)

@@ -13,11 +13,14 @@ from typing import Any
 import numpy as np
 
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.files import library
 from emberlink.envs.fire_files.report import SECONDS, Clock, Report, ask
-from emberlink.envs.fire_files.tables import FOLDERS, attributes, column_named, plain
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import as_argument
 
+_OUTSIDE = ("Name", "Folder", "File")
+"""Columns of what stands outside the attributes, and may hold a date: of KML, and of a folder."""
+FOLDERS = " > "
+"""Between the names of folders of KML, one within the other."""
 _MAPPED = (
     r"(poly)?polygond\w*|polypolyg|perimeterd\w*|perdat\w*|gdbfromdat\w*|datetime|timestamp|tutc"
     r"|acqdat\w*|validat|date|time|t|begin|elapsed\w*|seconds|minutes|hours|days"
@@ -36,13 +39,14 @@ _DAYS = {
 _ORDERS = ("day_first", "month_first", "year_first")
 _SINCE_1970 = {"seconds": 1, "milliseconds": 1000}
 _DIGITS = {
+    0: _ORDERS,
     8: ("%Y%m%d",),
     10: ("seconds", "%y%m%d%H%M", "%Y%m%d%H"),
     12: ("%Y%m%d%H%M",),
     13: ("milliseconds",),
     14: ("%Y%m%d%H%M%S",),
 }
-"""Patterns of texts of digits, by their length."""
+"""Patterns of texts of digits, by their length; 0 for other texts."""
 _ZONES = {"Z": "+0000", "UTC": "+0000", "GMT": "+0000", "UT": "+0000"}
 _ZONES |= {"EST": "-0500", "EDT": "-0400", "CST": "-0600", "CDT": "-0500", "MST": "-0700"}
 _ZONES |= {"MDT": "-0600", "PST": "-0800", "PDT": "-0700", "AKST": "-0900", "AKDT": "-0800"}
@@ -62,39 +66,44 @@ _DATE = re.compile(
 """A day, with or without a time of day and its zone."""
 
 
+def plain(name: Any) -> str:
+    """Returns the letters and digits of a column's name, in lower case."""
+    return re.sub(r"[\W_]", "", str(name).lower())
+
+
+def column_named(name: str, table: Any, key: str) -> Any:
+    """Returns the column with a name in any case."""
+    columns = {str(column).lower(): column for column in table}
+    if (wanted := name.strip().lower()) not in columns:
+        known = ", ".join(map(str, [*table][:30])) or "none"
+        raise UserError(f"no column {name.strip()!r} ({key}); there are {known}")
+    return columns[wanted]
+
+
 def read_times(
-    frame: Any, config: FileFireConfig, outside: Sequence[str], report: Report
+    table: Any, shapes: Any, config: FileFireConfig, report: Report
 ) -> tuple[np.ndarray, Clock]:
-    """Returns the time of each feature; the values of columns `outside` stand beside the table."""
+    """Returns the time of each feature, and their clock."""
     if "%" not in (config.time_format or ""):  # of names and descriptions, only the date in them
-        loose = [name for name in attributes(frame) if name in (*outside, "Description")]
-        frame = frame.assign(**{name: frame[name].map(date_within) for name in loose})
-    names = _columns(frame, config.time_field, outside)
-    if len(empty := frame.index[(frame[names] == "").any(axis=1)]):
-        seen = f"{empty[0]} has no time in {names[0]} ({len(empty)} of {len(frame)})"
+        loose = table.columns.intersection([*_OUTSIDE, "Description"])
+        table = table.assign(**{name: table[name].map(date_within) for name in loose})
+    names = _columns(table, config.time_field)
+    if len(empty := table.index[(table[names] == "").any(axis=1)]):
+        seen = f"{empty[0]} has no time in {names[0]} ({len(empty)} of {len(table)})"
         raise ask(seen, "one in each", f"fire.where={names[0]} to leave out those without")
-    if len(names) == 1 and config.time_format is None:
-        numbers = library("pandas").to_numeric(frame[names[0]], errors="coerce")
-        if numbers.notna().all() and not all(map(is_date, frame[names[0]].unique())):
-            about = f"{names[0]} ({numbers.min():g} to {numbers.max():g})"
-            if not numbers.between(0, 1e12).all():
-                raise ask(about, "times of 0 or more")
-            title = plain(names[0])
-            known = (u for u in SECONDS if re.fullmatch(rf"elapsed{u[:2]}\w*|{u}", title))
-            unit = decided_unit(next(known, None), config, about)
-            report.facts.append(f"times from {names[0]}")
-            return in_order(numbers.to_numpy(float), unit, config)
+    texts = table[names[0]]
+    if len(names) == 1 and config.time_format is None and not all(map(is_date, texts.unique())):
+        numbers = texts.str.extract(r"^(\d+(?:\.\d*)?(?:e[-+]?\d+)?)$", expand=False).astype(float)
+        if numbers.notna().all():
+            return _elapsed(numbers.to_numpy(), names[0], config, report)
     if config.time_field is None and not _has_clock(
-        parse_dates([*frame[names[0]]], config.time_format, names[0])
+        parse_dates(texts, config.time_format, names[0])
     ):
-        names += _clocks_beside(frame, names[0])
+        names += _clocks_beside(table, names[0])
     title = " and ".join(map(str, names))
-    dates = parse_dates([*_joined(frame, names)], config.time_format, title)
-    aware = [date.tzinfo is not None for date in dates]
-    if len({*aware}) > 1:
-        some, other = frame.index[aware.index(True)], frame.index[aware.index(False)]
-        raise ask(f"{title}: {some} has a time zone and {other} has none", "one in all")
-    zone = "zone of the file" if all(aware) else "no zone in the file, read as UTC"
+    dates = parse_dates(_joined(table, names), config.time_format, title)
+    naive = any(date.tzinfo is None for date in dates)
+    zone = "no zone in the file, read as UTC" if naive else "zone of the file"
     report.facts.append(f"times from {title}, {zone}")
     moments = [in_utc(date) for date in dates]
     first, last = min(moments), max(moments)
@@ -102,35 +111,50 @@ def read_times(
     if last > datetime.now(UTC) + timedelta(days=1):
         report.doubts.append(f"{last:%Y-%m-%d} is in the future")
     days = np.unique(values) if not _has_clock(dates) else ()
-    if within := sum(_nested(frame.geometry[values == day]) for day in days):
+    if within := sum(_nested(shapes[values == day]) for day in days):
         report.doubts.append(
-            f"{len(frame)} features have {len(days)} dates in {title} without a time of day, and "
+            f"{len(table)} features have {len(days)} dates in {title} without a time of day, and "
             f"perimeters of one date lie in one another ({within} dates): their order is lost"
         )
     return values, Clock("minutes", first)
 
 
-def _columns(frame: Any, given: str | Sequence[str] | None, outside: Sequence[str]) -> list[Any]:
+def _elapsed(
+    values: np.ndarray, name: str, config: FileFireConfig, report: Report
+) -> tuple[np.ndarray, Clock]:
+    about = f"{name} ({values.min():g} to {values.max():g})"
+    known = (u for u in SECONDS if re.fullmatch(rf"elapsed{u[:2]}\w*|{u}", plain(name)))
+    unit = decided_unit(next(known, None), config, about)
+    report.facts.append(f"times from {name}")
+    return in_order(values, unit, config)
+
+
+def _columns(table: Any, given: str | Sequence[str] | None) -> list[Any]:
     """Returns the columns of `fire.time_field`, or the column with a known name; asks if unsure."""
     if given is not None:
         given = (given,) if isinstance(given, str) else given
-        return [column_named(name, frame, "fire.time_field") for name in given]
-    filled = [name for name in attributes(frame) if (frame[name] != "").any()]
-    known = [name for name in filled if name not in outside and re.fullmatch(_MAPPED, plain(name))]
-    dated = [name for name in filled if is_date(next(filter(None, frame[name])))]
+        return [column_named(name, table, "fire.time_field") for name in given]
+    filled = [name for name in table if (table[name] != "").any()]
+    known = [name for name in filled if re.fullmatch(_MAPPED, plain(name))]
+    dated = [name for name in filled if is_date(next(filter(None, table[name])))]
     found = [name for name in known if name in dated] or known
-    found = found or [name for name in outside if (frame[name] != "").all()]
-    if not found or frame[found].ne(frame[found[0]], axis=0).any(axis=None):
+    found = found or [name for name in filled if name in _OUTSIDE and all(table[name])]
+    if not found or table[found].ne(table[found[0]], axis=0).any(axis=None):
         maybe = found or [*dated, *(name for name in filled if name not in dated)][:15]
-        seen = ", ".join(f"{name} ({frame[name].iloc[0][:30]})" for name in maybe)
+        seen = ", ".join(f"{name} ({table[name].iloc[0][:30]})" for name in maybe)
         key = as_argument("fire.time_field", maybe[0]) if maybe else "a column of times"
         raise ask(f"which column holds the times: {seen or 'none'}?", f"{key} or such")
     return found[:1]
 
 
-def _clocks_beside(frame: Any, date: Any) -> list[Any]:
+def _clocks_beside(table: Any, date: Any) -> list[Any]:
     """Returns the column of times of day named as that of the dates; asks about others."""
-    names = [name for name in attributes(frame) if name != date and _is_clock(name, frame[name])]
+    names = []
+    for name in table.columns.drop(date):
+        values = table[name][table[name] != ""]
+        clock = values.str.match(r"\d{1,6}\b|\d\d?:\d\d").any()
+        half = len(values) > 0 and values.str.fullmatch(r"(?i)[ap]\.?m\.?").all()
+        names += [name] if half or (clock and re.fullmatch(_OF_DAY, plain(name))) else []
     if names and (len(names) > 1 or plain(date).replace("date", "time") != plain(names[0])):
         key = f"'fire.time_field=[{','.join([date, *names])}]' to join them"
         seen = f"{date} has no times of day, maybe {', '.join(names)} has"
@@ -138,25 +162,19 @@ def _clocks_beside(frame: Any, date: Any) -> list[Any]:
     return names
 
 
-def _is_clock(name: Any, column: Any) -> bool:
-    values = column[column != ""]
-    named = re.fullmatch(_OF_DAY, plain(name)) and values.str.match(r"\d{1,6}\b|\d\d?:\d\d").any()
-    return len(values) > 0 and (named or values.str.fullmatch(r"(?i)[ap]\.?m\.?").all())
-
-
-def _joined(frame: Any, names: Sequence[Any]) -> Any:
+def _joined(table: Any, names: Sequence[Any]) -> Any:
     """Joins dates with times of day in columns of hours, minutes, HHMM, HH:MM, and AM or PM."""
-    joined = frame[names[0]]
+    joined = table[names[0]]
     joined = joined.str.replace(_MIDNIGHT, "", regex=True) if len(names) > 1 else joined
-    for place, name in enumerate(names[1:]):
-        part, title = frame[name], plain(name)
+    for name in names[1:]:
+        part, title = table[name], plain(name)
         if re.fullmatch(_MINUTE, title):
             joined = joined.str.removesuffix(":00") + ":" + part.str.zfill(2)
             continue
-        digits = part.str.isdecimal()
-        short = digits & (part.str.len() < 3) & (re.fullmatch(_HOUR, title) is not None)
-        part = part.mask(digits, part.str.zfill(4)).mask(short, part + ":00")
-        if place == 0:  # AM or PM alone begins a half of the day
+        if re.fullmatch(_HOUR, title):
+            part = part.str.replace(r"^(\d\d?)$", r"\1:00", regex=True)
+        part = part.str.replace(r"^\d{1,3}$", lambda few: few[0].zfill(4), regex=True)
+        if name == names[1]:  # AM or PM alone begins a half of the day
             part = part.str.replace(r"(?i)^(?=[ap]\.?m)", "12 ", regex=True)
         joined += " " + part
     return joined
@@ -185,50 +203,49 @@ def in_order(
     values: np.ndarray, unit: str, config: FileFireConfig, origin: datetime | None = None
 ) -> tuple[np.ndarray, Clock]:
     """Returns times with their clock, days of the year continued over New Year; asks if unsure."""
-    if unit not in ("days", "day_of_year"):
-        return values, Clock(unit, origin)
-    days = np.unique(values[np.isfinite(values)])
-    gaps = np.diff(days, append=days[0] + (366 if days[-1] > 365 else 365))
-    last = int(gaps.argmax())
-    first = days[(last + 1) % len(days)]
-    cyclic = days[0] >= 1 and days[-1] <= 366 and (days % 1 == 0).all()
-    if unit == "day_of_year":
-        values = np.where(values < first, values + gaps.sum(), values)
-    elif config.start is None and cyclic and last < len(days) - 1 and gaps[last] > 183:
-        seen = f"days {days[0]:g} to {days[last]:g} and {first:g} to {days[-1]:g}, over New Year?"
-        raise ask(seen, "fire.units=day_of_year", f"fire.start={days[0]:g} for days as they are")
+    if unit in ("days", "day_of_year"):
+        days = np.unique(values[np.isfinite(values)])
+        gaps = np.diff(days, append=days[0] + (366 if days[-1] > 365 else 365))
+        last = int(gaps.argmax())
+        first = days[(last + 1) % len(days)]
+        cyclic = days[0] >= 1 and days[-1] <= 366 and (days % 1 == 0).all()
+        if unit == "day_of_year":
+            values = np.where(values < first, values + gaps.sum(), values)
+        elif config.start is None and cyclic and last < len(days) - 1 and gaps[last] > 183:
+            seen = f"days {days[0]:g} to {days[last]:g} and {first:g} to {days[-1]:g}"
+            start = f"fire.start={days[0]:g} for days as they are"
+            raise ask(f"{seen}, over New Year?", "fire.units=day_of_year", start)
     return values, Clock(unit, origin)
 
 
 def parse_dates(texts: Sequence[str], form: str | None, key: str) -> list[datetime]:
     """Reads calendar times in one format: `form`, which is `fire.time_format`, or the only fit."""
     distinct = [*dict.fromkeys(texts)]
-    fits, wrong = {}, distinct[0]
-    for name in (form,) if form else _forms(distinct):
-        with suppress(ValueError, OverflowError, OSError):
-            fits[name] = [_read(wrong := text, name) for text in distinct]
+    fits = _fits(distinct, form)
     if not fits:
+        wrong = next((text for text in distinct if not _fits([text], form)), distinct[0])
         raise ask(f"{key}={wrong[:40]!r} is not a date", "such as fire.time_format=%d.%m.%Y")
     if len({tuple(map(in_utc, dates)) for dates in fits.values()}) > 1:
         listed = " or ".join(f"{name} ({read[0]:%Y-%m-%d %H:%M})" for name, read in fits.items())
         keys = map("fire.time_format={}".format, fits)
-        raise ask(f"{key}={texts[0][:40]!r} fits {listed}", *keys)
+        raise ask(f"{key}={distinct[0][:40]!r} fits {listed}", *keys)
     read = dict(zip(distinct, next(iter(fits.values())), strict=True))
     return [read[text] for text in texts]
 
 
-def _forms(texts: Sequence[str]) -> tuple[str, ...]:
-    """Returns the patterns that may fit texts: of digits, if all have as many, or the orders."""
+def _fits(texts: Sequence[str], form: str | None) -> dict[str, list[datetime]]:
+    """Reads texts by the pattern `form`, or by each that may fit them all, by their digits."""
     lengths = {len(text) if text.isdecimal() else 0 for text in texts}
-    return _DIGITS.get(min(lengths), _ORDERS) if len(lengths) == 1 else _ORDERS
+    fits = {}
+    for name in (form,) if form else _DIGITS.get(max(lengths), ()) if len(lengths) == 1 else ():
+        with suppress(ValueError, OverflowError, OSError):
+            fits[name] = [_read(text, name) for text in texts]
+    return fits
 
 
 def is_date(text: str) -> bool:
     """Returns whether a text is a calendar time in one of the patterns."""
-    for form in _forms([text]) if not text.isdecimal() or len(text) in _DIGITS else ():
-        with suppress(ValueError, OverflowError, OSError):
-            return bool(_read(text, form))
-    return False
+    return bool(_fits([text], None))
 
 
 def date_within(text: str) -> str:

@@ -1,8 +1,6 @@
 """Runs `emberlink fire`: draws fires, and joins files of fires in one bank."""
 
 import io
-import json
-import math
 import os
 import re
 import warnings
@@ -17,7 +15,6 @@ from rich.console import Console
 from emberlink.envs.fire.generator import scenarios
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import read_with_summary
-from emberlink.envs.fire_files.report import counted
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.atomic_io import created, free_name, new_file, user_path
 from emberlink.envs.utils.errors import UserError, shown, unknown
@@ -41,62 +38,51 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
         text, _, index = text.rpartition(":")
     config = _config(overrides, text)
     fire, world = config.fire, config.env
-    fires, name, count, about = [], fire.name, MAX_FIRES, []
+    fires, name, count, about = None, fire.name, MAX_FIRES, []
     if isinstance(fire, FileFireConfig):
         fires, read = read_with_summary(fire, world.grid, world.horizon)
         name, count, about = Path(fire.path).name, len(fires), [f"read: {read}"]
     if not is_index(index, count):
         raise UserError(f"{shown(name)}: no fire {shown(index)!r}; known: 0 to {count - 1}")
-    if about:
-        arrival = fires[int(index)]
-        title = f"{name}, fire {index} of {count}" if count > 1 else name
+    if fires is None:
+        drawn = fires_of(fire).test_fire(int(index), world.grid, world.horizon)
+        arrival, title = split_times(drawn)[0][0].numpy(), f"{name}, test fire {index}"
     else:
-        arrival = split_times(fires_of(fire).test_fire(int(index), world.grid, world.horizon))[0][0]
-        title = f"{name}, test fire {index}"
+        arrival, title = fires[int(index)].numpy(), f"{name}, fire {index} of {count}"
     if path is None:
-        stem = f"fire_{Path(name).stem if about else name}" + f"_{index}" * (count > 1)
-        free = free_name(output or Path(), re.sub(r"[^\w.+-]", "-", stem)[:100], [".png"])
-        path = free.with_name(f"{free.name}.png")
+        stem = re.sub(r"[^\w.+-]", "-", f"fire_{Path(name).stem}_{index}")[:100]
+        path = Path(f"{free_name(output or Path(), stem, ['.png'])}.png")
     width = 2 * view_radius(world.altitude[1], world.view_angle)
     with created(path) as partial, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph")  # the font may lack letters of the file's name
-        arrival_figure(partial, arrival.numpy(), world.horizon, width, shown(title))
+        arrival_figure(partial, arrival, world.horizon, width, shown(title))
     grid = " x ".join(map(str, world.grid))
     first = f"{shown(title)}: {grid} cells, {world.horizon} steps, setup {config.setup}"
-    _print(console, first, *about, *_growth(arrival.numpy(), world, width), str(path))
+    _print(console, first, *about, *_growth(arrival, world, width), str(path))
     return 0
 
 
 def import_files(arguments: Sequence[str], console: Console, output: Path) -> int:
     """Reads files of fires, prints its reading of each, and writes them to a bank.
 
-    A bank is an .npy of steps, float32 [fires, X, Y], inf for never, with a .json of its facts.
+    A bank is an .npy of steps, float32 [fires, X, Y], inf for never.
     """
     paths, overrides = _divided(arguments)
-    card = new_file(new_file(output, [".npy"]).with_suffix(".json"), [".json"])
-    fires, sources, horizon = [], [], 0
+    output, fires = new_file(output, [".npy"]), []
     for path in paths:
         config = _config(overrides, path)
-        fire, world, horizon = config.fire, config.env, config.env.horizon
-        if not isinstance(fire, FileFireConfig):
+        if not isinstance(config.fire, FileFireConfig):
             raise UserError(f"{shown(path)} is a scenario; expected a file")
-        read, about = read_with_summary(fire, world.grid, horizon)
+        read, about = read_with_summary(config.fire, config.env.grid, config.env.horizon)
         _print(console, f"{Path(path).name}: read: {about}")
         fires.append(read)
-        sources.append({"file": Path(path).name, "sha256": fire.sha256, "fires": len(read)})
-        if math.isfinite(fire.burn_time):
-            warnings.warn("fire.burn_time is not written; give it with the bank", stacklevel=2)
     if not fires:
         raise UserError("FILE is missing; expected a file, such as ArrivalTime.asc")
-    facts = {"axes": ["fire", "x", "y"], "horizon": horizon, "sources": sources}
     bank, memory = torch.cat(fires), io.BytesIO()
     np.save(memory, bank.numpy())  # in memory first: NumPy does not report a full disk
-    with created(card) as text, created(output) as partial:
-        text.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    with created(output) as partial:
         partial.write_bytes(memory.getbuffer())
-    count, across, up = bank.shape
-    _print(console, f"{counted(count, 'fire')} of {across} x {up} cells, {horizon} steps")
-    _print(console, str(output))
+    _print(console, f"{len(bank)} x {bank.shape[1]} x {bank.shape[2]} cells", str(output))
     return 0
 
 
@@ -135,9 +121,7 @@ def _growth(arrival: np.ndarray, world: Any, width: float) -> list[str]:
     since, end = int(gained.argmax()), int(burning[-1])
     mean, most = (end - burning[0]) / world.horizon, float(gained[since]) / window
     uncovered = world.num_uavs * width * world.displacement
-    in_view = min(end, world.num_uavs * width**2)
-    steps = math.ceil(max(0.0, end - in_view) / uncovered)
-    quick, enough = most <= uncovered, steps <= world.horizon
+    steps = max(0.0, end - world.num_uavs * width**2) / uncovered
     return [
         f"burning at the start  {burning[0]} cells",
         f"burning at the end    {end} cells",
@@ -145,9 +129,6 @@ def _growth(arrival: np.ndarray, world: Any, width: float) -> list[str]:
         f"growth, maximum       {most:.3g} cells/step, steps {since} to {since + window}",
         f"a UAV flies           {world.displacement:.3g} cells/step",
         f"a UAV sees            {width:.3g} cells across, from full altitude",
-        f"the team uncovers     {uncovered:.3g} cells/step at most",
-        f"UAVs can keep up: {'yes' if quick and enough else 'no'}",
-        f"  {'-+'[quick]} the team can uncover {uncovered:.3g} cells/step, {most:.3g} burn anew",
-        f"  {'-+'[enough]} of {end} cells at the end {in_view:.4g} can be in view at once; "
-        f"uncovering others takes at least {steps} of {world.horizon} steps",
+        f"the team uncovers     {uncovered:.3g} cells/step, all at the end in {steps:.0f} steps",
+        f"UAVs can keep up: {'yes' if most <= uncovered and steps <= world.horizon else 'no'}",
     ]
