@@ -7,6 +7,7 @@ The driver follows from the first bytes, so that no text in a file can choose an
 import hashlib
 import logging
 import re
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -77,7 +78,8 @@ def find_format(path: Path) -> str:
     kind = _format(path)
     if kind in ("csv", "kml", "points", "json") and (size := path.stat().st_size) > MAX_BYTES:
         raise ask(f"{size} bytes", f"a text file of at most {MAX_BYTES}")
-    for part in _beside(path):
+    for part in (path, *_beside(path)):
+        _check_size(part)
         # GDAL opens masks and overviews in any format; some formats read other addresses.
         if part.suffix.lower() in (".msk", ".ovr") and _format(part) != "tif":
             raise ask(f"{part.name}, beside it, is no TIFF", "one, or no such file")
@@ -95,6 +97,20 @@ def _format(path: Path) -> str:
             return kind
     known = "GeoTIFF, NetCDF, ESRI ASCII, .npy, .shp, .gpkg, GeoJSON, KML, KMZ, CSV of points"
     raise ask(f"{path.name} begins with {head[:16]!r}", f"{known}, the paper's text")
+
+
+def _check_size(path: Path) -> None:
+    """Checks that a file has the bytes that its header declares; GDAL reads the rest of it."""
+    with open_regular(path, 2**63) as file:
+        head = file.read(100).ljust(100, b"\0")
+    records, start, row = struct.unpack("<IHH", head[4:12])
+    told = {
+        ".dbf": start + records * row,
+        ".gpkg": int.from_bytes(head[16:18]) * int.from_bytes(head[28:32]),
+        **dict.fromkeys((".shp", ".shx"), 2 * int.from_bytes(head[24:28])),
+    }.get(path.suffix.lower(), 0)
+    if path.stat().st_size < told:
+        raise ask(f"{path.name} is damaged", f"{told} bytes or more")
 
 
 def _beside(path: Path) -> list[Path]:

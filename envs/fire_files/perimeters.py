@@ -55,7 +55,7 @@ class Perimeters:
             new[i[there], j[there]] = True
             new &= np.isinf(times)
             idle += k > 0 and not new.any()
-            burnt = shapely.union_all([burnt, *shapely.simplify(parts, points.side / 20)])
+            burnt = shapely.union_all([burnt, *shapely.simplify(parts, points.side / 100)])
             apart = max(points.side / 2, burnt.length / _MAX_POINTS)
             edge = shapely.get_coordinates(shapely.segmentize(burnt.boundary, apart))
             front = KDTree(edge, balanced_tree=False, compact_nodes=False)

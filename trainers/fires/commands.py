@@ -82,7 +82,8 @@ def import_files(arguments: Sequence[str], console: Console, output: Path) -> in
     np.save(memory, bank.numpy())  # in memory first: NumPy does not report a full disk
     with created(output) as partial:
         partial.write_bytes(memory.getbuffer())
-    _print(console, f"{len(bank)} x {bank.shape[1]} x {bank.shape[2]} cells", str(output))
+    count, across, up = bank.shape
+    _print(console, f"{count} fires of {across} x {up} cells, in steps", str(output))
     return 0
 
 

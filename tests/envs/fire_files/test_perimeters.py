@@ -60,15 +60,13 @@ def test_a_fire_is_the_same_from_its_raster_and_from_its_perimeters(tmp_path, na
 
 
 def test_before_the_first_perimeter_by_hand(tmp_path):
-    """Edges move 50 m an hour, so that a square of 300 m after an hour is one of 200 m at 0."""
+    """The fire is a point at 0, in the middle of its first perimeter."""
     squares(300, 400, Elapsed_Mi=[60, 120]).to_file(tmp_path / "fire.shp")
     fire = read(tmp_path / "fire.shp", (40, 40), 120, margin=0.0)  # cells of 10 m
-    assert (fire[10:30, 10:30] == 0).all()
-    assert (fire == 0).sum() == 20 * 20
+    assert 1 <= (fire == 0).sum() <= 4
     assert (fire <= 60).sum() == pytest.approx(30 * 30, abs=4 * 30)
     assert (fire[5:9, 20] > 0).all()
     assert (fire[5:9, 20] < 60).all()
-    # The fire was a point three hours before the first perimeter, and stays one earlier.
     for first, width in ((180, 30), (360, 30)):
         squares(300, 400, Elapsed_Mi=[first, first + 60]).to_file(tmp_path / "late.shp")
         late = read(tmp_path / "late.shp", (40, 40), first + 60, margin=0.0, start=0.0)
