@@ -44,25 +44,27 @@ class Perimeters:
     def on(self, window: Window, until: float, report: Report) -> np.ndarray:
         """Divides the time between two fronts by a sample's distances to both, float64 [X, Y]."""
         points, idle = window.samples(), 0
-        centres = np.stack(points.centres(), -1)
-        index = shapely.STRtree(shapely.points(centres.reshape(-1, 2)))
+        centres = np.stack(points.centres(), -1).reshape(-1, 2)
+        index = shapely.STRtree(shapely.points(centres))
         times, burnt, last = np.full(points.grid, np.inf), shapely.Polygon(), None
         for k, parts in enumerate(self.areas):
-            new = np.zeros(points.grid, bool)
-            new.flat[index.query(parts, predicate="intersects")[1]] = True
-            own = shapely.get_coordinates(shapely.point_on_surface(parts))
-            i, j, there = points.cells(*own.T)  # the smallest spot fire has a sample of its own
-            new[i[there], j[there]] = True
-            new &= np.isinf(times)
-            idle += k > 0 and not new.any()
-            burnt = shapely.union_all([burnt, *shapely.simplify(parts, points.side / 100)])
+            part, at = index.query(parts, predicate="intersects")
+            # The smallest spot fire has a sample of its own.
+            i, j, there = points.cells(*shapely.get_coordinates(shapely.point_on_surface(parts)).T)
+            part = np.append(part, np.flatnonzero(there))
+            at = np.append(at, i[there] * points.grid[1] + j[there])
+            fresh = np.isinf(times.flat[at])
+            idle += k > 0 and not fresh.any()
+            burnt = shapely.union_all([burnt, *parts[np.unique(part[fresh])]])
             apart = max(points.side / 2, burnt.length / _MAX_POINTS)
             edge = shapely.get_coordinates(shapely.segmentize(burnt.boundary, apart))
             front = KDTree(edge, balanced_tree=False, compact_nodes=False)
-            times[new] = self.at[k]
+            new = np.unique(at[fresh])
+            times.flat[new] = self.at[k]
             if last is not None:
                 passed, left = (tree.query(centres[new])[0] for tree in (last, front))
-                times[new] -= (self.at[k] - self.at[k - 1]) * left / (passed + left + 1e-9)
+                share = left / (passed + left + 1e-9)
+                times.flat[new] -= (self.at[k] - self.at[k - 1]) * share
             last = front
             if self.at[k] >= until:
                 break
