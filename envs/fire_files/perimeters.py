@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import shapely
+from scipy.ndimage import binary_erosion
 from scipy.spatial import KDTree
 
 from emberlink.envs.fire_files.config import FileFireConfig
@@ -45,8 +46,8 @@ class Perimeters:
         """Divides the time between two fronts by a sample's distances to both, float64 [X, Y]."""
         points, idle = window.samples(), 0
         centres = np.stack(points.centres(), -1).reshape(-1, 2)
-        index = shapely.STRtree(shapely.points(centres))
-        times, burnt, last = np.full(points.grid, np.inf), shapely.Polygon(), None
+        index = shapely.STRtree([*shapely.points(centres)])
+        times, front = np.full(points.grid, np.inf), KDTree(np.empty((0, 2)))
         for k, parts in enumerate(self.areas):
             part, at = index.query(parts, predicate="intersects")
             # The smallest spot fire has a sample of its own.
@@ -55,21 +56,32 @@ class Perimeters:
             at = np.append(at, i[there] * points.grid[1] + j[there])
             fresh = np.isinf(times.flat[at])
             idle += k > 0 and not fresh.any()
-            burnt = shapely.union_all([burnt, *parts[np.unique(part[fresh])]])
-            apart = max(points.side / 2, burnt.length / _MAX_POINTS)
-            edge = shapely.get_coordinates(shapely.segmentize(burnt.boundary, apart))
-            front = KDTree(edge, balanced_tree=False, compact_nodes=False)
-            new = np.unique(at[fresh])
+            new, last = np.unique(at[fresh]), front
             times.flat[new] = self.at[k]
-            if last is not None:
+            apart = max(points.side / 2, float(shapely.length(parts).sum()) / _MAX_POINTS)
+            edges = shapely.segmentize(shapely.boundary(parts[np.unique(part[fresh])]), apart)
+            edge = np.concatenate([last.data, shapely.get_coordinates(edges)])
+            edge = _front(edge, np.isfinite(times), points)
+            front = KDTree(edge, balanced_tree=False, compact_nodes=False)
+            if k > 0:
                 passed, left = (tree.query(centres[new])[0] for tree in (last, front))
                 share = left / (passed + left + 1e-9)
                 times.flat[new] -= (self.at[k] - self.at[k - 1]) * share
-            last = front
             if self.at[k] >= until:
                 break
         report.facts += [f"{idle} within the area burnt before"] if idle else []
         return window.earliest(times)
+
+
+def _front(edge: np.ndarray, burnt: np.ndarray, points: Window) -> np.ndarray:
+    """Returns points of edges that don't lie in the burnt area, four in a sample at most."""
+    inner: Any = binary_erosion(burnt, np.ones((3, 3)))
+    i, j, there = points.cells(*edge.T)
+    there[there] = inner[i[there], j[there]]
+    edge = edge[~there]
+    edge = edge[np.lexsort(edge.T)]  # whatever the order of the file
+    x, y = np.floor(edge / (points.side / 2)).astype(np.int64).T
+    return edge[np.unique(x * 2**31 + y, return_index=True)[1]]
 
 
 def read_perimeters(path: Path, kind: str, config: FileFireConfig, report: Report) -> Perimeters:
@@ -139,7 +151,7 @@ def _areas(shapes: Any) -> np.ndarray:
         gap = (shapely.distance(*ends) / shapely.length(merged)).max()
         if gap > _GAP:
             raise ask(f"{name}: a line is not closed, {gap:.0%} are missing", "closed lines")
-        rings = [shapely.linearrings(shapely.get_coordinates(line)) for line in merged]
+        rings: Any = [shapely.linearrings(shapely.get_coordinates(line)) for line in merged]
         found = np.append(
             found, shapely.build_area(shapely.node(shapely.geometrycollections(rings)))
         )

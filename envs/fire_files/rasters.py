@@ -62,7 +62,8 @@ class Raster:
             burnt = self.times <= until
             if burnt.sum() < 2:
                 raise UserError(f"until {self.clock.format(until)} no fire spreads: a single cell")
-            at = np.stack(np.nonzero(burnt & ~binary_erosion(burnt)))
+            inner: Any = binary_erosion(burnt)
+            at = np.stack(np.nonzero(burnt & ~inner))
             # Along each axis, the front has passed the centre by less than a cell.
             before = [minimum_filter1d(self.times, 3, axis)[*at] for axis in (0, 1)]
             left, passed = until - self.times[*at], self.times[*at] - before
@@ -162,7 +163,7 @@ def _opened(path: Path, kind: str, layer: str | None) -> Iterator[Any]:
             seen = f"{len(found)} variables: {', '.join(found[:30])}"
             raise ask(seen, f"the one of arrival times, such as fire.layer={some}")
         name = f'NETCDF:"{name}":{layer}' if found else name
-    more = {"DATATYPE": "Float64"} if kind == "asc" else {}
+    more: Any = {"DATATYPE": "Float64"} if kind == "asc" else {}
     with rasterio.open(name, driver=_DRIVERS[kind], **more) as dataset:
         yield dataset
 
@@ -301,7 +302,8 @@ def _plateaus(times: np.ndarray, told: np.ndarray, counts: np.ndarray) -> np.nda
     held = np.flatnonzero(counts)
     odd = (counts > counts.sum() / 2) & (len(held) > 1)
     if len(held) > 3:
-        edge = times[np.isfinite(times) & ~binary_erosion(np.isfinite(times))]
+        inner: Any = binary_erosion(np.isfinite(times))
+        edge = times[np.isfinite(times) & ~inner]
         for at, (first, last) in ((held[0], held[[1, -1]]), (held[-1], held[[-2, 0]])):
             far = abs(told[at] - told[first]) > abs(told[last] - told[first])
             rest = np.delete(counts, at).max()
