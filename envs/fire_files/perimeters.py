@@ -64,13 +64,29 @@ class Perimeters:
             edge = _front(edge, np.isfinite(times), points)
             front = KDTree(edge, balanced_tree=False, compact_nodes=False)
             if k > 0:
-                passed, left = (tree.query(centres[new])[0] for tree in (last, front))
-                share = left / (passed + left + 1e-9)
-                times.flat[new] -= (self.at[k] - self.at[k - 1]) * share
+                share = _share(last, front, centres[new])
+                times.flat[new] -= (self.at[k] - self.at[k - 1]) * (1 - share)
             if self.at[k] >= until:
                 break
         report.facts += [f"{idle} within the area burnt before"] if idle else []
         return window.earliest(times)
+
+
+def _share(last: KDTree, front: KDTree, points: np.ndarray) -> np.ndarray:
+    """Returns how far points are on their way from one front to the next, 0 to 1, [n].
+
+    A point is compared with the point of the next front that lies in the same direction from the
+    same place of the last one: both have moved with the same speed.
+    """
+    (passed, here), (whole, there) = last.query(points), last.query(front.data)
+    reach = float(whole.mean()) + 1e-9
+
+    def rays(ends: np.ndarray, feet: Any, lengths: np.ndarray) -> np.ndarray:
+        away = (ends - last.data[feet]) / np.maximum(lengths, 1e-9)[:, None]
+        return np.hstack([last.data[feet], reach * away])
+
+    ahead = KDTree(rays(front.data, there, whole)).query(rays(points, here, passed))[1]
+    return np.minimum(passed / np.maximum(whole[ahead], 1e-9), 1)
 
 
 def _front(edge: np.ndarray, burnt: np.ndarray, points: Window) -> np.ndarray:
