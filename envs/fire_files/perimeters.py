@@ -46,7 +46,7 @@ class Perimeters:
         """Divides the time between two fronts by a sample's distances to both, float64 [X, Y]."""
         points, idle = window.samples(), 0
         centres = np.stack(points.centres(), -1).reshape(-1, 2)
-        index = shapely.STRtree([*shapely.points(centres)])
+        index = shapely.STRtree(shapely.points(centres))  # pyright: ignore
         times, front = np.full(points.grid, np.inf), KDTree(np.empty((0, 2)))
         for k, parts in enumerate(self.areas):
             part, at = index.query(parts, predicate="intersects")
