@@ -15,7 +15,7 @@ from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.files import damage, members
 from emberlink.envs.fire_files.plane import Bounds, Plane, Window, choose_plane
 from emberlink.envs.fire_files.report import Clock, Report, ask
-from emberlink.envs.fire_files.times import decided_unit, in_order, parse_dates
+from emberlink.envs.fire_files.times import decided_unit, in_order, in_utc, parse_dates
 from emberlink.envs.utils.errors import UserError
 
 _MAX_CELLS = 50_000_000
@@ -196,7 +196,7 @@ def _band(dataset: Any, last: bool, config: FileFireConfig) -> tuple[np.ndarray,
     if known == "no unit of time":
         raise ask(f"{what} is in {name[:20]}, {known}", "arrival times")
     unit = decided_unit(known, config, what)
-    origin = parse_dates([since.strip()], None, "units")[0] if since else None
+    origin = in_utc(parse_dates([since.strip()], None, "units")[0]) if since else None
     return *in_order(times, unit, config, origin), what
 
 
