@@ -190,14 +190,14 @@ def _band(dataset: Any, last: bool, config: FileFireConfig) -> tuple[np.ndarray,
     what += f", the last of {band} times" if band > 1 else ""
     what += f" ({declared})" if declared else ""
     values = _read(dataset, _MAX_CELLS, band)[0] * dataset.scales[band - 1]
-    times = _arrival(values + dataset.offsets[band - 1], config, dataset.read_masks(band) == 0)
+    values, nodata = values + dataset.offsets[band - 1], dataset.read_masks(band) == 0
     name, _, since = declared.partition(" since ")
     known = next((u for u, form in _UNITS.items() if re.fullmatch(form, name, re.IGNORECASE)), None)
     if known == "no unit of time":
         raise ask(f"{what} is in {name[:20]}, {known}", "arrival times")
     unit = decided_unit(known, config, what)
     origin = in_utc(parse_dates([since.strip()], None, "units")[0]) if since else None
-    return *in_order(times, unit, config, origin), what
+    return *in_order(_arrival(values, config, nodata), unit, config, origin), what
 
 
 def _of_states(maps: np.ndarray, config: FileFireConfig) -> tuple[np.ndarray, Clock, str]:
