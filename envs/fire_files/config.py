@@ -4,9 +4,10 @@ import dataclasses
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import STRICT, Name
 
 Units = Literal["steps", "seconds", "minutes", "hours", "days", "day_of_year"]
@@ -71,6 +72,12 @@ class FileFireConfig:
         default=None, compare=False
     )
     """A run's own copy of the grids; set when a run folder is opened, and never written."""
+
+    @model_validator(mode="after")
+    def _one_end(self) -> "FileFireConfig":
+        if self.end is not None and self.minutes_per_step is not None:
+            raise UserError("end and minutes_per_step: give one of them")
+        return self
 
     @property
     def never(self) -> tuple[float, ...] | None:

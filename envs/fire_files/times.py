@@ -102,8 +102,10 @@ def read_times(
         names += _clocks_beside(table, names[0])
     title = " and ".join(map(str, names))
     dates = parse_dates(_joined(table, names), config.time_format, title)
-    naive = any(date.tzinfo is None for date in dates)
-    zone = "no zone in the file, read as UTC" if naive else "zone of the file"
+    naive = {date.tzinfo is None for date in dates}
+    if len(naive) > 1:
+        raise ask(f"{title}: some times have a zone and others have none", "one in all")
+    zone = "no zone in the file, read as UTC" if True in naive else "zone of the file"
     report.facts.append(f"times from {title}, {zone}")
     moments = [in_utc(date) for date in dates]
     first, last = min(moments), max(moments)
