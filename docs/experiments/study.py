@@ -32,7 +32,7 @@ TEACHER = {"relay": ["learner.teacher=shuttle"]}
 OF_MAP = [
     *("learner.critic_map=true", "learner.bfloat16=true", "learner.log_std=-1.2"),
     *("learner.gamma=0.95", "learner.gae_lambda=0.95", "learner.epochs=1", "learner.lr=1e-3"),
-    *("num_envs=32", "episodes=80", "evaluation.interval=5"),
+    *("learner.minibatches=8", "num_envs=32", "episodes=80", "evaluation.interval=5"),
 ]
 ATTENTION = "policy.message=attention"
 EXCHANGES: dict[str, tuple[str, Sequence[str]]] = {

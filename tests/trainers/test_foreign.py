@@ -224,7 +224,6 @@ def test_a_folder_that_names_code_inside_it_is_refused(tmp_path):
     ("name", "method", "message"),
     [
         ("strong/maps", "consensus", "strong/maps: a policy of maps .*'crops'.* consensus "),
-        ("consensus", "independent", "consensus: a policy of consensus .* independent "),
         ("strong/independent", "shared_memory", ""),
     ],
 )

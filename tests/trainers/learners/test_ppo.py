@@ -160,10 +160,11 @@ def test_only_mappos_critic_reads_the_true_map():
     assert maps[:, 1:].equal(after[:, :-1])
     assert after[:, -1].any()
     learner: Any = setup.learner
-    assert keys.TRUE_MAP in learner.critic.in_keys
-    assert keys.TRUE_MAP not in learner.explorer.in_keys
+    assert keys.TRUE_MAP in set(learner.critic.in_keys) - set(learner.explorer.in_keys)
     assert keys.TRUE_MAP not in make_env(setup.config).reset()
     check_env_specs(setup.env)
+    learner = made("mappo", "learner.critic_map=true", method="maps").learner
+    assert keys.CROPS in set(learner.actor.in_keys) - set(learner.critic.in_keys)
     batch = first_batches(made("mappo", "learner.critic_map=true"))[0]
     changed = batch.clone()
     changed[keys.TRUE_MAP][:, 2] = 2 - changed[keys.TRUE_MAP][:, 2]
@@ -179,23 +180,12 @@ def test_only_mappos_critic_reads_the_true_map():
     assert not any(one.isclose(other).any() for one, other in combinations(values, 2))
 
 
-def test_a_critic_of_the_true_map_reads_no_pictures():
-    learner: Any = made("mappo", "learner.critic_map=true", method="maps").learner
-    assert keys.CROPS in learner.actor.in_keys
-    assert keys.CROPS not in learner.critic.in_keys
-
-
 def test_updates_with_16_bits_have_nearly_the_losses_of_32():
     batch = first_batches(made("mappo", method="maps"))[0]
-    (full, exact), (half, near) = (
-        (setup.learner, setup.learner.update(batch.clone()))
-        for setup in (made("mappo", f"learner.bfloat16={x}", method="maps") for x in (False, True))
-    )
+    setups = (made("mappo", f"learner.bfloat16={x}", method="maps") for x in (False, True))
+    exact, near = (setup.learner.update(batch.clone()) for setup in setups)
     assert not exact["critic"].equal(near["critic"])
-    for name in ("actor", "critic"):
-        torch.testing.assert_close(exact[name], near[name], rtol=0.05, atol=0.01)
-    assert {x.dtype for x in half.loss.parameters()} == {torch.float32}
-    assert full.loss.state_dict().keys() == half.loss.state_dict().keys()
+    torch.testing.assert_close(exact, near, rtol=0.05, atol=0.01)
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
