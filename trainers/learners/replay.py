@@ -16,8 +16,6 @@ from emberlink.trainers.learners.tensors import flatten, group, prefixed, unflat
 
 DONE = (keys.AGENTS, "done")
 TERMINATED = (keys.AGENTS, "terminated")
-_SAID = "Initialized LazyTensorStorage"  # the Python functions print nothing
-logging.getLogger("torchrl").addFilter(lambda record: _SAID not in str(record.msg))
 
 
 class TeamReplay:
@@ -57,6 +55,7 @@ class TeamReplay:
         """decisions of the batch of environments before the first batch"""
         self.written = 0
         """rows written so far, including overwritten ones"""
+        logging.getLogger("torchrl").addFilter(_tells_no_storage)
         self._buffer = ReplayBuffer(
             storage=LazyTensorStorage(self.capacity, device=context.device),
             sampler=UavSampler(uavs, generator, shared=shared and mixed, joint=joint),
@@ -128,6 +127,10 @@ class UavSampler(RandomSampler):
         size = count, 1 if self.joint else len(self.own)
         drawn = torch.randint(limit, size, generator=self.generator, device=self.own.device)
         return drawn.expand(-1, len(self.own))
+
+
+def _tells_no_storage(record: logging.LogRecord) -> bool:
+    return "Initialized LazyTensorStorage" not in str(record.msg)  # at each training's first row
 
 
 def to_rows(rollout: TensorDictBase, context: LearnerContext) -> TensorDict:
