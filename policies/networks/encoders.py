@@ -72,8 +72,9 @@ class PictureEncoder(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Maps uint8 [groups, rows, pictures, channels, S, S] to [groups, rows, features]."""
         groups, encoded, kind = len(x), [], x.device.type
-        half = torch.is_autocast_enabled(kind)
-        dtype = torch.get_autocast_dtype(kind) if half else torch.float32
+        dtype = next(self.parameters()).dtype
+        if torch.is_autocast_enabled(kind):
+            dtype = torch.get_autocast_dtype(kind)
         pictures: Any = self.pictures
         for layers, picture in zip(pictures, x.unbind(2), strict=True):
             # Bytes with the channels last: the convolutions are then a quarter faster on a CPU. A
