@@ -72,14 +72,13 @@ class PictureEncoder(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Maps uint8 [groups, rows, pictures, channels, S, S] to [groups, rows, features]."""
         groups, encoded, kind = len(x), [], x.device.type
-        dtype = next(self.parameters()).dtype
-        if torch.is_autocast_enabled(kind):
-            dtype = torch.get_autocast_dtype(kind)
+        half = torch.is_autocast_enabled(kind)
         pictures: Any = self.pictures
         for layers, picture in zip(pictures, x.unbind(2), strict=True):
             # Bytes with the channels last: the convolutions are then a quarter faster on a CPU. A
             # picture of floats is copied, as it is the caller's.
             y = picture.transpose(0, 1).flatten(1, 2).contiguous(memory_format=torch.channels_last)
+            dtype = torch.get_autocast_dtype(kind) if half else layers[0].weight.dtype
             y = y.to(dtype, copy=True).div_(255)
             for layer in layers:
                 y = layer(y).relu_()
