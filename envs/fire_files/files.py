@@ -8,9 +8,12 @@ import hashlib
 import logging
 import re
 import struct
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+import numpy as np
 
 from emberlink.envs.fire_files.report import ask
 from emberlink.envs.utils.atomic_io import open_regular, user_path
@@ -40,8 +43,18 @@ _GRID = "ForestGrid"  # begins the names of Cell2Fire's maps
 _SUFFIXES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".kmz", ".csv")
 _BESIDE = ".shx .dbf .prj .cpg -wal -journal .aux.xml .msk .ovr .aux .tfw .tifw .tiffw .wld .tab"
 """Endings of the files that the libraries open beside one."""
-for _name in ("rasterio", "pyogrio"):
-    logging.getLogger(_name).setLevel(logging.CRITICAL)  # damage is reported as an error instead
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Silences the warnings and logs of the libraries. Damage is reported as an error instead."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
+            yield
+    finally:
+        logging.disable(before)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
-from emberlink.envs.fire_files.files import TABLES, digest, find_format, naming_file
+from emberlink.envs.fire_files.files import TABLES, digest, find_format, naming_file, quiet
 from emberlink.envs.fire_files.grid import on_grid
 from emberlink.envs.fire_files.rasters import MAX_BANK, read_raster
 from emberlink.envs.fire_files.report import Report, ask
@@ -31,11 +31,7 @@ def read_with_summary(
     The fires are float32 [fires, X, Y], in steps; inf never burns.
     """
     report = Report()
-    with (
-        naming_file(config.path, config.layer) as path,
-        warnings.catch_warnings(action="ignore"),
-        np.errstate(all="ignore"),
-    ):
+    with naming_file(config.path, config.layer) as path, quiet():
         kind = find_format(path)
         table = kind in TABLES
         for key in ("unburned",) if table else _OF_TABLES:

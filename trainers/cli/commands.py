@@ -104,12 +104,12 @@ def add_eval(commands: Any) -> None:
 def _eval(options: argparse.Namespace, console: "Console") -> int:
     from emberlink.trainers.runs import pretrained
 
-    name, (method, *settings) = options.folder, [*options.overrides, ""]
+    name, (method, *settings) = options.folder, options.overrides or [""]
     folder = pretrained.find_one(name) if pretrained.is_name(name) else path(name)
     if (file := folder / "config.yaml").is_file():
         _check_changes(file, options.overrides)
     elif method and "=" not in method:
-        _check_names(method, settings[:-1])
+        _check_names(method, settings)
     return run_of("evaluation.evaluate_run:run_command")(options, console)
 
 

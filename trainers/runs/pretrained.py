@@ -45,11 +45,12 @@ def open_run(text: str) -> "RunFolder":
 
     A trained policy of the package is copied to a run folder in `runs`, unless there is a copy.
     """
-    run = read_run(text)
+    from emberlink.trainers.runs.run_folder import RunFolder
+
     if not is_name(text):
-        return run
-    source = run.path
-    run = type(run)(Path("runs") / "_".join([_COPY, *source.parts[-3:]]))
+        return RunFolder(text)
+    source = find_one(text)
+    run = RunFolder(Path("runs") / "_".join([_COPY, *source.parts[-3:]]))
     with naming(run.path):
         run.path.mkdir(parents=True, exist_ok=True)
         if not run.newest.exists():
