@@ -1,16 +1,20 @@
 """Trains the arms of the study (docs/study.md) in its order.
 
-    python docs/experiments/study.py list OUTPUT           # prints the commands
-    python docs/experiments/study.py run OUTPUT            # runs them, and skips what is finished
-    python docs/experiments/study.py run OUTPUT front/map  # only these arms of a world
+    python docs/experiments/study.py list OUTPUT             # prints the commands
+    python docs/experiments/study.py run OUTPUT              # runs them, and skips what is finished
+    python docs/experiments/study.py run OUTPUT front/map_m  # only those whose folders begin so
 
-Each training is one process with one thread; one that was stopped is resumed.
+Each training is one process with one thread, as many at once as there are processors; one that was
+stopped is resumed.
 """
 
+import os
 import shlex
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 from pathlib import Path
 
 NEW = ["evaluation.huygens=false", "fire.test_seed=1500000"]
@@ -32,7 +36,7 @@ TEACHER = {"relay": ["learner.teacher=shuttle"]}
 OF_MAP = [
     *("learner.critic_map=true", "learner.bfloat16=true", "learner.log_std=-1.2"),
     *("learner.gamma=0.95", "learner.gae_lambda=0.95", "learner.epochs=1", "learner.lr=1e-3"),
-    *("learner.minibatches=8", "num_envs=32", "episodes=80", "evaluation.interval=5"),
+    *("learner.minibatches=8", "num_envs=32", "episodes=40", "evaluation.interval=5"),
 ]
 ATTENTION = "policy.message=attention"
 EXCHANGES: dict[str, tuple[str, Sequence[str]]] = {
@@ -72,51 +76,60 @@ def settings(world: str, observed: str, name: str) -> list[str]:
     return [method, *ALL, f"world={world}", *WORLDS[world], *shown, *exchange]
 
 
-def commands(output: Path, world: str, observed: str, name: str) -> Iterator[list[str]]:
-    """Yields the commands of an arm; those that name a run are known once it has been trained."""
-    common, folder = settings(world, observed, name), output / world / f"{observed}_{name}"
-    count = 10 if world == "front" and name in MOST else 5
-    trained = common + (OF_VECTOR if observed == "vector" else OF_MAP)
-    for seed in range(count):
-        more = [f"seed={seed}", *OF_SWEEP]
-        if observed == "map":
-            first = output / world / f"imitation_{name}"
-            taught = [*OF_IMITATION, *TEACHER.get(world, [])]
-            yield ["sweep", *common, *taught, *more, f"output={first}"]
-            more.append(f"learner.warm_start={_run(first, seed)}")
-        yield ["sweep", *trained, *more, f"output={folder}"]
-        for fault in ("zero", "shuffle") if "message" in str(common) else ():
-            run = _run(folder, seed)
-            if not (run / f"eval_evaluation.message_fault={fault}.json").exists():
-                yield ["eval", str(run), f"evaluation.message_fault={fault}"]
+def seeds(world: str, name: str) -> int:
+    """Returns how many seeds an arm has."""
+    return 10 if world == "front" and name in MOST else 5
 
 
-def _run(folder: Path, seed: int) -> Path:
-    """Returns the run of a seed."""
-    return next(folder.glob(f"*_s{seed}_*"), folder / f"RUN_s{seed}")
+def commands(folder: Path, seed: int) -> Iterator[list[str]]:
+    """Yields the commands of a seed of OUTPUT/WORLD/ARM; each is known once the one before ran."""
+    world, (observed, name) = folder.parent.name, folder.name.split("_", 1)
+    common, more = settings(world, observed, name), [f"seed={seed}", *OF_SWEEP]
+    if observed == "map":
+        first = folder.with_name(f"imitation_{name}") / f"s{seed}"
+        taught = [*OF_IMITATION, *TEACHER.get(world, [])]
+        yield ["sweep", *common, *taught, *more, f"output={first}"]
+        more.append(f"learner.warm_start={_run(first)}")
+    trained = OF_VECTOR if observed == "vector" else OF_MAP
+    yield ["sweep", *common, *trained, *more, f"output={folder / f's{seed}'}"]
+    for fault in ("zero", "shuffle") if "message" in str(common) else ():
+        run = _run(folder / f"s{seed}")
+        if not (run / f"eval_evaluation.message_fault={fault}.json").exists():
+            yield ["eval", str(run), f"evaluation.message_fault={fault}"]
+
+
+def _run(folder: Path) -> Path:
+    """Returns the run in a folder."""
+    return next(folder.glob("*_s*_*/"), folder / "RUN")
 
 
 def main(verb: str, output: str, *parts: str) -> int:
-    """Prints or runs all commands; returns how many failed."""
-    failed = 0
-    for world in WORLDS:
-        chosen = [arm for arm in arms(world) if f"{world}/{arm[0]}".startswith(parts or "")]
-        scripted = Path(output) / world / "scripted.json"
-        scripted.parent.mkdir(parents=True, exist_ok=True)
-        check = ["world", "check", world, "setup=strong", *WORLDS[world], "--json", str(scripted)]
-        if chosen and not scripted.exists() and world != "paper":
-            failed += _do(verb, check)
-        for line in (line for arm in chosen for line in commands(Path(output), world, *arm)):
-            failed += _do(verb, line)
-    return failed
+    """Prints or runs all commands; returns how many seeds and checks failed."""
+    jobs: list[Iterator[list[str]]] = []
+    for world, settings_of_world in WORLDS.items():
+        folder = Path(output) / world
+        chosen = [
+            commands(folder / "_".join(arm), seed)
+            for seed, arm in product(range(10), arms(world))
+            if seed < seeds(world, arm[1])
+            and f"{world}/{'_'.join(arm)}/s{seed}".startswith(parts or "")
+        ]
+        check = ["world", "check", world, "setup=strong", *settings_of_world, "--json"]
+        if chosen and world != "paper" and not (folder / "scripted.json").exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            jobs.append(iter([[*check, str(folder / "scripted.json")]]))
+        jobs.extend(chosen)
+    with ThreadPoolExecutor(os.cpu_count() if verb == "run" else 1) as threads:
+        return sum(threads.map(lambda lines: any(_do(verb, line) for line in lines), jobs))
 
 
-def _do(verb: str, line: Sequence[str]) -> int:
-    print("emberlink", shlex.join(line), flush=True)
+def _do(verb: str, line: Sequence[str]) -> bool:
+    sys.stdout.write(f"emberlink {shlex.join(line)}\n")
+    sys.stdout.flush()
     if verb != "run":
-        return 0
+        return False
     program = [sys.executable, "-m", "emberlink.trainers.cli"]
-    return int(subprocess.run([*program, *line], check=False).returncode != 0)
+    return subprocess.run([*program, *line], check=False).returncode != 0
 
 
 if __name__ == "__main__":
