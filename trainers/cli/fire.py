@@ -13,16 +13,15 @@ def add_fire(commands: Any) -> None:
         commands,
         "fire",
         "preview fires, import them from files",
-        "Draws a fire and tells whether UAVs can keep up with it, and imports fires from files.",
+        "Draws fires, and imports fires from files.",
         "emberlink fire preview huygens:3",
     )
     preview = command(
         actions,
         "fire preview",
         "fires.commands:preview",
-        "draw a fire and tell whether UAVs can keep up",
-        "Draws the arrival times of a fire with contours, prints what was understood of a file, "
-        "the growth of the fire, and whether the setup's UAVs can keep up with it.",
+        "draw a fire",
+        "Draws the arrival times of a fire, and prints what was understood of a file.",
         "emberlink fire preview ArrivalTime.asc fire.units=minutes 'env.grid=[40,40]' setup=tuned",
     )
     source = "a scenario (or huygens:3, its test fire 3), a file (or bank.npy:3), or fire=NAME; "

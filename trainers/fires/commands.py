@@ -6,7 +6,6 @@ import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -58,7 +57,8 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
         arrival_figure(partial, arrival, world.horizon, width, shown(title))
     grid = " x ".join(map(str, world.grid))
     first = f"{shown(title)}: {grid} cells, {world.horizon} steps, setup {config.setup}"
-    _print(console, first, *about, *_growth(arrival, world, width), str(path))
+    begin, end = ((arrival <= step).sum() for step in (0, world.horizon))
+    _print(console, first, *about, f"{begin} cells burn by step 0, {end} at the end", str(path))
     return 0
 
 
@@ -111,25 +111,3 @@ def _config(overrides: Sequence[str], source: str) -> RunConfig:
 def _print(console: Console, *lines: str) -> None:
     for line in lines:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
-
-
-def _growth(arrival: np.ndarray, world: Any, width: float) -> list[str]:
-    """Returns lines about the growth of a fire, and whether the team can keep up with it."""
-    window = max(1, world.horizon // 20)
-    times = np.sort(arrival, axis=None)
-    burning = np.searchsorted(times, np.arange(world.horizon + 1), side="right")
-    gained = burning[window:] - burning[:-window]
-    since, end = int(gained.argmax()), int(burning[-1])
-    mean, most = (end - burning[0]) / world.horizon, float(gained[since]) / window
-    uncovered = world.num_uavs * width * world.displacement
-    steps = max(0.0, end - world.num_uavs * width**2) / uncovered
-    return [
-        f"burning at the start  {burning[0]} cells",
-        f"burning at the end    {end} cells",
-        f"growth, mean          {mean:.3g} cells/step",
-        f"growth, maximum       {most:.3g} cells/step, steps {since} to {since + window}",
-        f"a UAV flies           {world.displacement:.3g} cells/step",
-        f"a UAV sees            {width:.3g} cells across, from full altitude",
-        f"the team uncovers     {uncovered:.3g} cells/step, all at the end in {steps:.0f} steps",
-        f"UAVs can keep up: {'yes' if most <= uncovered and steps <= world.horizon else 'no'}",
-    ]

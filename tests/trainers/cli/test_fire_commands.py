@@ -37,16 +37,6 @@ def refused(capsys, *arguments) -> str:
     return refusal.refused(["fire", *arguments], capsys, f"emberlink fire {arguments[0]}: ")
 
 
-def numbers(lines: list[str]) -> dict[str, float]:
-    """Returns the rows of numbers."""
-    rows = (
-        line.partition("  ")
-        for line in lines
-        if line[:8] in ("burning ", "growth, ", "the team") or line.startswith("a UAV")
-    )
-    return {name.strip(): float(rest.split()[0]) for name, _, rest in rows}
-
-
 def area(path, colour: tuple[float, ...] | str) -> int:
     """Returns the number of pixels of a colour or a grey value."""
     wanted = [255 * float(colour)] * 3 if isinstance(colour, str) else colour
@@ -72,18 +62,8 @@ def test_preview_prints_the_numbers_of_the_test_fire(capsys):
     burning = burning_cells(fire[None], 400)[0]
     lines = ran(capsys, "preview", "huygens:3", "env.grid=[40,30]", "env.horizon=400")
     assert lines[0] == "huygens, test fire 3: 40 x 30 cells, 400 steps, setup paper"
-    rows = numbers(lines)
-    sees = 8 / 3**0.5  # 2 x 4 x tan 30 degrees
-    expected = {
-        "burning at the start": burning[0],
-        "burning at the end": burning[-1],
-        "growth, mean": float(burning[-1] - burning[0]) / 400,
-        "growth, maximum": max(int(burning[t + 20] - burning[t]) for t in range(381)) / 20,
-        **{"a UAV flies": 1, "a UAV sees": sees, "the team uncovers": 6 * sees},
-    }
-    assert rows == pytest.approx({k: float(v) for k, v in expected.items()}, rel=0.01)
-    assert lines[-2] == "UAVs can keep up: yes"
-    assert all(len(line) <= 80 for line in lines[:9])
+    assert lines[1] == f"{burning[0]} cells burn by step 0, {burning[-1]} at the end"
+    assert all(len(line) <= 80 for line in lines)
     assert lines[-1] == "fire_huygens_3.png"
 
 
@@ -116,7 +96,7 @@ def test_import_of_several_files(capsys, tmp_path):
     lines = ran(capsys, "preview", "both.npy:1", *keys[1:])
     assert lines[1].startswith("read: a bank of 2 fires of 25 x 20 cells")
     assert lines[0] == "both.npy, fire 1 of 2: 25 x 20 cells, 200 steps, setup paper"
-    assert numbers(lines)["burning at the end"] == np.isfinite(both[1]).sum()
+    assert lines[2].endswith(f", {np.isfinite(both[1]).sum()} at the end")
     assert lines[-1] == "fire_both_1.png"
     with pytest.warns(UserWarning, match="fire.end=200 stretches them"):
         ran(capsys, "import", "both.npy", "env.horizon=150", "--output", "cut.npy")
