@@ -55,7 +55,7 @@ def _blank_figures(request, monkeypatch) -> None:
     from emberlink.trainers.evaluation import evaluate_run, figures
 
     blank = _blank()
-    for name in ("coverage_bars", "timelapse", "training_curves"):
+    for name in ("timelapse", "training_curves"):
         monkeypatch.setattr(figures, name, lambda path, *_: path.write_bytes(blank))
 
     def save(_: Figure, file: io.BytesIO | Path, **__) -> None:

@@ -1,49 +1,66 @@
-"""Adds finished runs to the trained policies that are installed with emberlink.
+"""Adds finished runs to the trained policies that are installed, or puts seeds in one archive.
 
 python docs/experiments/pack_policies.py RUN... policies/pretrained
+python docs/experiments/pack_policies.py RUN... docs/weights/ARM.tar.xz   # with 16 bits
 """
 
 import shutil
 import sys
+import tarfile
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from emberlink.envs.fire_files.config import COPY_FILE
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.learners.base import ACTOR
+from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs import checkpoint
 from emberlink.trainers.runs.pretrained import collection, is_name
 from emberlink.trainers.runs.run_folder import NEWEST, RunFolder
 
 
-def pack(run: RunFolder, into: Path) -> Path:
-    """Copies a finished run to the trained policies, without training states and critics."""
+def reduced(run: RunFolder) -> RunConfig:
+    """Returns the configuration of a finished run without what is of one machine."""
     trained = run.config(device="cpu")
     learner: Any = trained.learner
     if (start := getattr(learner, "warm_start", "")) and not is_name(start):
-        learner = replace(learner, warm_start=f"runs/{Path(start).name}")  # no local path
-    config = replace(trained, output="runs", logger="none", device="cpu", learner=learner)
-    if len(run.metrics()) < config.episodes or not run.evaluated():
+        learner = replace(learner, warm_start=f"runs/{Path(start).name}")
+    if len(run.metrics()) < trained.episodes or not run.evaluated():
         raise UserError(f"{run.path}: not finished, or not evaluated")
-    target = into / collection(config) / config.method / f"s{config.seed}"
+    return replace(trained, output="runs", logger="none", device="cpu", learner=learner)
+
+
+def pack(run: RunFolder, target: Path, *, half: bool = False) -> Path:
+    """Copies a finished run without training states and critics; with `half`, the actors alone."""
     if target.exists():
         raise UserError(f"{target}: exists already")
-    actors = checkpoint.read_tensors(run.newest, f"{checkpoint.WEIGHTS}{ACTOR}")
+    config, prefix = reduced(run), f"{checkpoint.WEIGHTS}{ACTOR}"
+    actors = checkpoint.read_tensors(run.newest, prefix)
     target.mkdir(parents=True)
-    checkpoint.write(
-        target / NEWEST,
-        checkpoint.header_of(config, run.step()),
-        {f"{checkpoint.WEIGHTS}{ACTOR}{name}": value for name, value in actors.items()},
-    )
+    kept = {f"{prefix}{name}": value.half() if half else value for name, value in actors.items()}
+    checkpoint.write(target / NEWEST, checkpoint.header_of(config, run.step()), kept)
     RunFolder(target).write_config(config)
-    for file in ("metrics.jsonl", "eval.json", COPY_FILE):
+    for file in () if half else ("metrics.jsonl", "eval.json", COPY_FILE):
         if (run.path / file).is_file():
             shutil.copyfile(run.path / file, target / file)
     return target
 
 
+def main(*texts: str) -> None:
+    """Packs runs."""
+    runs, into = [RunFolder(text) for text in texts[:-1]], Path(texts[-1])
+    if into.suffix != ".xz":
+        for run in runs:
+            config = reduced(run)
+            print(pack(run, into / collection(config) / config.method / f"s{config.seed}"))
+        return
+    with TemporaryDirectory() as folder, tarfile.open(into, "x:xz") as archive:
+        for run in runs:
+            pack(run, Path(folder) / f"s{run.config(device='cpu').seed}", half=True)
+        archive.add(folder, into.name.partition(".")[0])
+
+
 if __name__ == "__main__":
-    *runs, into = sys.argv[1:]
-    for path in runs:
-        print(pack(RunFolder(path), Path(into)))
+    main(*sys.argv[1:])

@@ -1,13 +1,14 @@
-"""Writes the tables between markers on the pages from docs/data.
+"""Writes the tables between markers on the pages, and figures, from docs/data.
 
     python docs/experiments/tables.py                          # make tables
-    python docs/experiments/tables.py pack NAME [LABEL=]RUNS…  # makes the files of a study
+    python docs/experiments/tables.py pack NAME [LABEL=]RUNS…  # adds runs to the files of a study
 
 `<!-- table: NAME -->` names a table of tables.yaml. A cell is an expression, its row in the place
 of `{}` in its column or the other way round: function, runs, measure and number of digits, such as
 `iqm front/maps coverage 1`.
 """
 
+import io
 import json
 import re
 import sys
@@ -18,19 +19,23 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import yaml
+from matplotlib import rc_context
+from matplotlib.figure import Figure
 
 from emberlink.envs import metrics
-from emberlink.trainers.comparison import bootstrap
+from emberlink.trainers.comparison import bootstrap, drawing
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "docs" / "data"
+TEXTS = Path(__file__).with_suffix(".yaml")
 TABLE = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
+OF_ROW = ("measure", "fire", "value")
 POINTS = 40  # most of a learning curve: means of equal parts of a training
 
 
 def written(text: str) -> str:
     """Returns the text of a page with its tables as the data have them."""
-    known = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
+    known = yaml.safe_load(TEXTS.read_text())
     return TABLE.sub(lambda found: f"{found[1]}{table(**known[found[2]])}{found[3]}", text)
 
 
@@ -39,7 +44,8 @@ def table(
 ) -> str:
     """Returns a table; `first` is the head of the names of rows, and a list holds texts.
 
-    The p-values of the column `holm` are corrected; those without data are 1.
+    The p-values of the column `holm` are corrected; those without data are 1. Rows without data are
+    left out.
     """
     lines = [[first, *columns], ["---"] * (len(columns) + first.count("|") + 1)]
     for name, row in rows.items():
@@ -50,17 +56,23 @@ def table(
         corrected = bootstrap.holm([float(line[place] or 1) for line in tested])
         for line, p in zip(tested, corrected, strict=True):
             line[place] = line[place] and f"{p:.4f}"
+    lines = [line for line in lines if any(line[1:])]
     return "".join(f"| {' | '.join(line)} |\n".replace("|  |", "| |") for line in lines)
 
 
-def cell(row: str, column: str) -> str:
-    """Returns the text of an expression; empty if its first run does not exist."""
-    expression = row.replace("{}", column) if "{}" in row else column.replace("{}", row)
-    function, *runs, measure, digits = expression.split()
+def computed(expression: str) -> Any:
+    """Returns the value of an expression and the ends of its interval, None without its runs."""
+    function, *runs, measure, _ = expression.split()
     samples = [sample(*run.split("/"), measure) for run in runs]
-    if not len(samples[0]):
+    return FUNCTIONS[function](samples, measure) if all(map(len, samples)) else None
+
+
+def cell(row: str, column: str) -> str:
+    """Returns the text of an expression; empty if its runs do not exist."""
+    expression = row.replace("{}", column) if "{}" in row else column.replace("{}", row)
+    if (found := computed(expression)) is None:
         return ""
-    value, ends = FUNCTIONS[function](samples, measure)
+    (value, ends), digits = found, expression.split()[-1]
     if np.isnan(value):
         return "undetermined"
     texts = [f"{x:,.{digits}f}".replace("-", "\N{MINUS SIGN}") for x in (value, *(ends or ()))]
@@ -144,10 +156,58 @@ FUNCTIONS: dict[str, Any] = {
 }
 
 
-def pack(name: str, *folders: str) -> None:
-    """Writes evaluations, learning curves and configurations of runs to docs/data.
+def figures() -> dict[str, Figure]:
+    """Returns the figures of the pages by their names in docs/images."""
+    return {"study": gains(**yaml.safe_load(TEXTS.read_text())["gains"]), "tuned": curves("tuned")}
 
-    The label of a folder without one is its name.
+
+def gains(columns: dict[str, str], rows: dict[str, str], **_: str) -> Figure:
+    """Returns the last column of a table as dots with their intervals."""
+    expressions = {name: [*columns.values()][-1].replace("{}", row) for name, row in rows.items()}
+    found = {name: value for name, text in expressions.items() if (value := computed(text))}
+    figure = Figure(figsize=(8, 0.8 + 0.4 * len(found)), layout="constrained")
+    axes = figure.subplots()
+    for y, (value, ends) in enumerate(found.values()):
+        axes.plot(ends, [y, y], "|-", lw=2, ms=9, mew=1.5, color=drawing.COLOURS[0])
+        axes.plot([value], [y], "o", ms=7, color=drawing.COLOURS[0])
+    names = [re.sub(r"`", "", name).replace(" | ", ": ", 1) for name in found]
+    axes.set_yticks(range(len(found)), [name.replace(" | ", ", ") for name in names])
+    axes.set(xlabel=f"gain of teams trained with messages, {[*columns][-1].split(', ')[1]}")
+    axes.axvline(0, color="0.3", lw=1.3)
+    axes.invert_yaxis()
+    axes.grid(alpha=0.3, axis="x")
+    return figure
+
+
+def curves(study: str) -> Figure:
+    """Returns the paper's figures 5 to 9 of its four methods."""
+    rows, measures = [], [name for panel, _ in drawing.FIGURES.values() for name in panel]
+    labels = ["consensus", "independent", "positional", "shared_memory"]
+    for label, measure in ((label, measure) for label in labels for measure in measures):
+        points = frame(f"{study}.curves")[label, measure].pivot(index="seed", columns="fire")
+        found = points["value"].to_numpy()
+        low, high = bootstrap.interval(bootstrap.iqm, found, axis=0, resamples=2000)
+        about = {"label": label, "measure": measure, "episode": points["value"].columns}
+        middle = bootstrap.iqm(found, axis=0)
+        rows.append(pd.DataFrame({**about, "iqm": middle, "low": low, "high": high}))
+    none = pd.DataFrame(columns=["label", "measure", "iqm"])
+    figure = drawing.training(pd.concat(rows), none, measures, labels)
+    figure.set_size_inches(16, 3.4)
+    return figure
+
+
+def svg(figure: Figure) -> str:
+    """Returns a figure as text, the same each time."""
+    memory = io.StringIO()
+    with rc_context({"svg.hashsalt": "emberlink", "svg.fonttype": "none"}):
+        figure.savefig(memory, format="svg", metadata={"Date": None, "Creator": None})
+    return memory.getvalue()
+
+
+def pack(name: str, *folders: str) -> None:
+    """Adds evaluations, learning curves and configurations of runs to docs/data.
+
+    The label of a folder without one is its name. Rows that are there already are replaced.
     """
     rows: dict[Any, Any] = {}
     curves, configs = [], {}
@@ -170,16 +230,28 @@ def pack(name: str, *folders: str) -> None:
             part = means.rename_axis("episode").melt(var_name="measure", ignore_index=False)
             curves.append(part.dropna().reset_index().assign(run=label, seed=config["seed"]))
     table = [(*key, fire, x) for key, values in rows.items() for fire, x in enumerate(values)]
-    data = pd.DataFrame(table, columns=["run", "seed", "measure", "fire", "value"])
-    save = partial(pd.DataFrame.to_csv, index=False, float_format="%.6g")
-    save(data.astype({"seed": "Int64"}), DATA / f"{name}.csv.xz")
+    add(DATA / f"{name}.csv.xz", pd.DataFrame(table, columns=["run", "seed", *OF_ROW]))
     if curves:
-        save(pd.concat(curves), DATA / f"{name}.curves.csv.xz")
-        (DATA / f"{name}.yaml").write_text(yaml.safe_dump(configs))
+        add(DATA / f"{name}.curves.csv.xz", pd.concat(curves))
+        file = DATA / f"{name}.yaml"
+        before = yaml.safe_load(file.read_text()) if file.exists() else {}
+        file.write_text(yaml.safe_dump({**before, **configs}))
+
+
+def add(file: Path, table: Any) -> None:
+    """Adds rows to a file."""
+    if file.exists():
+        table = pd.concat([pd.read_csv(file), table])
+    rows = table.astype({"seed": "Int64"}).drop_duplicates(
+        [*table.columns.drop("value")], keep="last"
+    )
+    rows.to_csv(file, index=False, float_format="%.6g")
 
 
 def write() -> None:
-    """Writes the tables of all pages."""
+    """Writes the figures and the tables of all pages."""
+    for name, figure in figures().items():
+        (ROOT / "docs" / "images" / f"{name}.svg").write_text(svg(figure))
     for page in (ROOT / "README.md", *ROOT.glob("docs/**/*.md")):
         page.write_text(written(page.read_text()))
 

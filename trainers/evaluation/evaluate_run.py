@@ -92,7 +92,7 @@ def evaluate_run(
         results, failed = play(None), str(error)
     else:
         shown = Episode(title=title_of(config, *policy.changes), recording=recorder.recording())
-        _draw(run, config, results, shown, label)
+        _draw(run, config, shown, label)
     scenarios = evaluate.evaluation_scenarios(config)
     policies = next(iter(results.values()))
     content = {
@@ -122,11 +122,7 @@ def evaluate_run(
     return results
 
 
-def _draw(
-    run: RunFolder, config: RunConfig, results: Results, episode: Episode, label: str
-) -> None:
-    with run.figure(f"coverage{label}.png") as path:
-        figures.coverage_bars(path, results)
+def _draw(run: RunFolder, config: RunConfig, episode: Episode, label: str) -> None:
     if lines := run.metrics():
         title = f"{config.method}, setup {config.setup}, fire {config.fire.name}"
         with run.figure("training.png") as path:

@@ -1,4 +1,4 @@
-"""Draws the figures of a run: training curves, coverage, timelapse."""
+"""Draws the figures of a run: training curves, timelapse."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from emberlink.trainers.evaluation.scores import CURVES, LEARNED, Results
+from emberlink.trainers.evaluation.scores import CURVES
 from emberlink.trainers.replay.recording import Recording
 from emberlink.trainers.replay.screen import draw_step, even_steps
 
@@ -33,29 +33,6 @@ def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) 
         axes.grid(alpha=0.3)
     for text in figure.axes[0].legend(fontsize="small").get_texts():
         text.set_parse_math(False)
-    figure.savefig(path, format="png", dpi=120)
-
-
-def coverage_bars(path: Path, results: Results) -> None:
-    """Draws the coverage of each policy on the test fires: a dot per episode, a bar at the mean."""
-    most = max(len(by_policy) for by_policy in results.values())
-    size = max(2.8, 1.6 + 0.55 * most) * len(results), 4.1
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(1, len(results), squeeze=False, sharey=True)[0]
-    for axes, (fire, by_policy) in zip(panels, results.items(), strict=True):
-        for place, (policy, measured) in enumerate(by_policy.items()):
-            values = np.asarray(measured["coverage"])
-            colour = "tab:orange" if policy == LEARNED else "0.75"
-            axes.bar(place, values.mean(), color=colour)
-            axes.text(place, 101, f"{values.mean():.0f}", ha="center", fontsize="small")
-            spread = place + np.linspace(-0.3, 0.3, len(values))
-            axes.plot(spread, values, "k.", ms=2, alpha=0.4)
-        names = [name.replace("_", " ") for name in by_policy]
-        axes.set_xticks(range(len(by_policy)), names, rotation=35, ha="right")
-        axes.set_title(f"test fires:\n{fire}", pad=18)
-        axes.set(ylim=(0, 100), axisbelow=True)
-        axes.grid(axis="y", alpha=0.3)
-    panels[0].set_ylabel("coverage, % (mean above)")
     figure.savefig(path, format="png", dpi=120)
 
 

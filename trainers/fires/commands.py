@@ -19,7 +19,6 @@ from emberlink.envs.utils.atomic_io import created, free_name, new_file, user_pa
 from emberlink.envs.utils.errors import UserError, shown, unknown
 from emberlink.envs.utils.validation import is_index
 from emberlink.envs.world.coverage_map import split_times
-from emberlink.envs.world.sensor import view_radius
 from emberlink.trainers.config.basics import MAX_FIRES
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
@@ -51,10 +50,9 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
     if path is None:
         stem = re.sub(r"[^\w.+-]", "-", f"fire_{Path(name).stem}_{index}")[:100]
         path = Path(f"{free_name(output or Path(), stem, ['.png'])}.png")
-    width = 2 * view_radius(world.altitude[1], world.view_angle)
     with created(path) as partial, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph")  # the font may lack letters of the file's name
-        arrival_figure(partial, arrival, world.horizon, width, shown(title))
+        arrival_figure(partial, arrival, world.horizon, shown(title))
     grid = " x ".join(map(str, world.grid))
     first = f"{shown(title)}: {grid} cells, {world.horizon} steps, setup {config.setup}"
     begin, end = ((arrival <= step).sum() for step in (0, world.horizon))

@@ -5,19 +5,16 @@ from pathlib import Path
 import numpy as np
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 
 NEVER, BURNT_OUT = "0.9", "0.45"
-_VIEW = "#ffff00"  # as in animations
 
 
-def arrival_figure(
-    path: Path, arrival: NDArray[np.float32], horizon: int, width: float, title: str
-) -> None:
-    """Draws arrival times [X, Y] as colours with contours, and the `width` of a UAV's view."""
+def arrival_figure(path: Path, arrival: NDArray[np.float32], horizon: int, title: str) -> None:
+    """Draws arrival times [X, Y] as colours with contours."""
     figure = Figure(figsize=(7.5, 7.3), layout="constrained")
     axes, (across, up) = figure.subplots(), arrival.shape
     core = binary_fill_holes(arrival <= 0) & np.isinf(arrival)  # burnt before step 0
@@ -29,8 +26,6 @@ def arrival_figure(
     if shown.min() < levels[-1] and shown.max() > levels[0]:
         contours = axes.contour(shown, levels=levels, colors="white", linewidths=1.1)
         axes.clabel(contours, fmt="%g", fontsize="small")
-    corner = (across - width - 1, up - width - 1)
-    axes.add_patch(Rectangle(corner, width, width, fc="none", ec=_VIEW, lw=2))
     axes.set(xlim=(-0.5, across - 0.5), ylim=(-0.5, up - 0.5), xlabel="x, cells", ylabel="y, cells")
     short = title if len(title) <= 60 else f"{title[:32]}...{title[-25:]}"
     figure.suptitle(short, parse_math=False, fontsize="medium")
@@ -38,7 +33,6 @@ def arrival_figure(
     samples = [
         Patch(fc=BURNT_OUT, label="burnt out before step 0"),
         Patch(fc=NEVER, label="does not burn"),
-        Patch(fc="none", ec=_VIEW, lw=2, label=f"view of one UAV, {width:.3g} cells wide"),
     ]
-    figure.legend(handles=samples, loc="outside lower center", ncols=3, fontsize="small")
+    figure.legend(handles=samples, loc="outside lower center", ncols=2, fontsize="small")
     figure.savefig(path, format="png", dpi=120, metadata={"Software": None})

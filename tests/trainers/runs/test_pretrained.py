@@ -81,7 +81,7 @@ def test_a_name_replaces_a_run_folder(shipped, tmp_path, capsys):
         for path in (folder, shipped / "tuned" / "consensus" / "s3")
     )
     assert made == given  # the same fires, the same numbers
-    assert (folder / "figures" / "coverage.png").exists()
+    assert (folder / "figures" / "training.png").exists()
     assert main(["render", "pretrained:tuned/consensus/10", "pretrained:independent"]) == 0
     printed = capsys.readouterr().out
     assert "pretrained_tuned_consensus_s10/figures/side_by_side" in printed.replace("\n", "")
