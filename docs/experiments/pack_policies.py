@@ -14,8 +14,8 @@ from typing import Any
 
 from emberlink.envs.fire_files.config import COPY_FILE
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs import checkpoint
 from emberlink.trainers.runs.pretrained import collection, is_name
 from emberlink.trainers.runs.run_folder import NEWEST, RunFolder

@@ -12,7 +12,6 @@ from importlib.metadata import version
 
 from emberlink.envs.utils.errors import UserError, one_line, unknown
 from emberlink.trainers.cli import commands as of
-from emberlink.trainers.cli.completion import answer
 from emberlink.trainers.cli.fire import add_fire
 from emberlink.trainers.cli.list import add_list
 from emberlink.trainers.cli.parser import Parser
@@ -39,8 +38,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str]) -> int:
     parser, names = _parser()
-    if "_ARGCOMPLETE" in os.environ:  # the shell's script asks for words
-        answer(parser)
     if not words:
         parser.print_help()
         return 0
@@ -82,7 +79,6 @@ def _parser() -> tuple[Parser, list[str]]:
     parser = Parser(
         prog="emberlink",
         description="Teams of UAVs that learn to find and cover a spreading wildfire.",
-        epilog='Tab completes names after: eval "$(register-python-argcomplete emberlink)"',
     )
     parser.add_argument("--version", action="version", version=f"emberlink {version('emberlink')}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
