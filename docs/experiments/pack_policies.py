@@ -1,7 +1,7 @@
 """Adds finished runs to the trained policies that are installed, or puts seeds in one archive.
 
-python docs/experiments/pack_policies.py RUN... policies/pretrained
-python docs/experiments/pack_policies.py RUN... docs/weights/ARM.tar.xz   # with 16 bits
+python docs/experiments/pack_policies.py RUN... policies/pretrained/tuned/consensus
+python docs/experiments/pack_policies.py RUN... docs/weights/ARM.tar.xz   # rounded to 16 bits
 """
 
 import shutil
@@ -17,7 +17,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs import checkpoint
-from emberlink.trainers.runs.pretrained import collection, is_name
+from emberlink.trainers.runs.pretrained import is_name
 from emberlink.trainers.runs.run_folder import NEWEST, RunFolder
 
 
@@ -39,7 +39,9 @@ def pack(run: RunFolder, target: Path, *, half: bool = False) -> Path:
     config, prefix = reduced(run), f"{checkpoint.WEIGHTS}{ACTOR}"
     actors = checkpoint.read_tensors(run.newest, prefix)
     target.mkdir(parents=True)
-    kept = {f"{prefix}{name}": value.half() if half else value for name, value in actors.items()}
+    kept = {
+        f"{prefix}{name}": value.half().float() if half else value for name, value in actors.items()
+    }
     checkpoint.write(target / NEWEST, checkpoint.header_of(config, run.step()), kept)
     RunFolder(target).write_config(config)
     for file in () if half else ("metrics.jsonl", "eval.json", COPY_FILE):
@@ -49,17 +51,16 @@ def pack(run: RunFolder, target: Path, *, half: bool = False) -> Path:
 
 
 def main(*texts: str) -> None:
-    """Packs runs."""
+    """Packs runs into a folder or an archive, each as sSEED."""
     runs, into = [RunFolder(text) for text in texts[:-1]], Path(texts[-1])
-    if into.suffix != ".xz":
+    half = into.suffix == ".xz"
+    with TemporaryDirectory() as scratch:
+        folder = Path(scratch) if half else into
         for run in runs:
-            config = reduced(run)
-            print(pack(run, into / collection(config) / config.method / f"s{config.seed}"))
-        return
-    with TemporaryDirectory() as folder, tarfile.open(into, "x:xz") as archive:
-        for run in runs:
-            pack(run, Path(folder) / f"s{run.config(device='cpu').seed}", half=True)
-        archive.add(folder, into.name.partition(".")[0])
+            pack(run, folder / f"s{run.config(device='cpu').seed}", half=half)
+        if half:
+            with tarfile.open(into, "x:xz") as archive:
+                archive.add(folder, into.name.partition(".")[0])
 
 
 if __name__ == "__main__":

@@ -12,7 +12,9 @@ import io
 import json
 import re
 import sys
+from collections.abc import Sequence
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -70,11 +72,12 @@ def computed(expression: str) -> Any:
 def cell(row: str, column: str) -> str:
     """Returns the text of an expression; empty if its runs do not exist."""
     expression = row.replace("{}", column) if "{}" in row else column.replace("{}", row)
-    if (found := computed(expression)) is None:
+    value, ends = computed(expression) or (None, None)
+    if value is None:
         return ""
-    (value, ends), digits = found, expression.split()[-1]
     if np.isnan(value):
         return "undetermined"
+    digits = expression.split()[-1]
     texts = [f"{x:,.{digits}f}".replace("-", "\N{MINUS SIGN}") for x in (value, *(ends or ()))]
     return f"{texts[0]} [{texts[1]}, {texts[2]}]" if ends and ends[0] < ends[1] else texts[0]
 
@@ -158,7 +161,16 @@ FUNCTIONS: dict[str, Any] = {
 
 def figures() -> dict[str, Figure]:
     """Returns the figures of the pages by their names in docs/images."""
-    return {"study": gains(**yaml.safe_load(TEXTS.read_text())["gains"]), "tuned": curves("tuned")}
+    known = yaml.safe_load(TEXTS.read_text())
+    panels = [name for measures, _ in drawing.FIGURES.values() for name in measures]
+    methods = ["consensus", "independent", "positional", "shared_memory"]
+    of_maps = [run for run in known["study_front"]["rows"].values() if run.startswith("map")]
+    return {
+        "gains": gains(**known["gains"]),
+        "learning": curves("study_front", of_maps, ["front/coverage"]),
+        "tuned_first": curves("tuned", methods, panels[:3]),
+        "tuned_last": curves("tuned", methods, panels[3:]),
+    }
 
 
 def gains(columns: dict[str, str], rows: dict[str, str], **_: str) -> Figure:
@@ -168,7 +180,7 @@ def gains(columns: dict[str, str], rows: dict[str, str], **_: str) -> Figure:
     figure = Figure(figsize=(8, 0.8 + 0.4 * len(found)), layout="constrained")
     axes = figure.subplots()
     for y, (value, ends) in enumerate(found.values()):
-        axes.plot(ends, [y, y], "|-", lw=2, ms=9, mew=1.5, color=drawing.COLOURS[0])
+        axes.plot(ends or [value] * 2, [y, y], "|-", lw=2, ms=9, mew=1.5, color=drawing.COLOURS[0])
         axes.plot([value], [y], "o", ms=7, color=drawing.COLOURS[0])
     names = [re.sub(r"`", "", name).replace(" | ", ": ", 1) for name in found]
     axes.set_yticks(range(len(found)), [name.replace(" | ", ", ") for name in names])
@@ -179,20 +191,25 @@ def gains(columns: dict[str, str], rows: dict[str, str], **_: str) -> Figure:
     return figure
 
 
-def curves(study: str) -> Figure:
-    """Returns the paper's figures 5 to 9 of its four methods."""
-    rows, measures = [], [name for panel, _ in drawing.FIGURES.values() for name in panel]
-    labels = ["consensus", "independent", "positional", "shared_memory"]
-    for label, measure in ((label, measure) for label in labels for measure in measures):
-        points = frame(f"{study}.curves")[label, measure].pivot(index="seed", columns="fire")
-        found = points["value"].to_numpy()
-        low, high = bootstrap.interval(bootstrap.iqm, found, axis=0, resamples=2000)
-        about = {"label": label, "measure": measure, "episode": points["value"].columns}
-        middle = bootstrap.iqm(found, axis=0)
-        rows.append(pd.DataFrame({**about, "iqm": middle, "low": low, "high": high}))
+def curves(study: str, labels: Sequence[str], measures: Sequence[str]) -> Figure:
+    """Returns the learning curves of the runs that there are."""
+    rows, every = [], frame(f"{study}.curves")
+    for key in product(labels, measures):
+        if key in every:
+            points = every[key].pivot(index="seed", columns="fire", values="value")
+            values, middle = points.to_numpy(), bootstrap.iqm(points.to_numpy(), axis=0)
+            ends = bootstrap.interval(bootstrap.iqm, values, axis=0, resamples=2000)
+            about = {
+                "label": key[0],
+                "measure": key[1].rpartition("/")[2],
+                "episode": points.columns,
+            }
+            low, high = ends or (np.nan, np.nan)
+            rows.append(pd.DataFrame({**about, "iqm": middle, "low": low, "high": high}))
     none = pd.DataFrame(columns=["label", "measure", "iqm"])
-    figure = drawing.training(pd.concat(rows), none, measures, labels)
-    figure.set_size_inches(16, 3.4)
+    shown = [measure.rpartition("/")[2] for measure in measures]
+    figure = drawing.training(pd.concat(rows), none, shown, labels)
+    figure.set_size_inches(3 + 2.6 * len(measures), 3.4)
     return figure
 
 
@@ -207,7 +224,8 @@ def svg(figure: Figure) -> str:
 def pack(name: str, *folders: str) -> None:
     """Adds evaluations, learning curves and configurations of runs to docs/data.
 
-    The label of a folder without one is its name. Rows that are there already are replaced.
+    The label of a folder without one is its name, that of a .json of `world check` the world. Rows
+    that are there already are replaced.
     """
     rows: dict[Any, Any] = {}
     curves, configs = [], {}
@@ -222,8 +240,14 @@ def pack(name: str, *folders: str) -> None:
                     own = (label, found["seed"]) if policy == "learned" else (policy, None)
                     for measure, values in measured.items():
                         rows.setdefault((own[0] + on, own[1], measure), values)
-        for file in sorted(Path(folder).rglob("config.yaml")):
-            configs.setdefault(label, config := yaml.safe_load(file.read_text()))
+        if folder.endswith(".json"):  # of `emberlink world check`
+            for policy, measured in json.loads(Path(folder).read_text())[label]["means"].items():
+                rows |= {(policy, None, name): [mean] for name, mean in measured.items()}
+        for file in sorted(Path(folder).rglob("eval.json")):
+            config = yaml.safe_load(file.with_name("config.yaml").read_text())
+            learner = config["learner"]
+            learner["warm_start"] = Path(learner.get("warm_start", "")).name
+            configs.setdefault(label, {**config, "output": "runs"})
             lines = pd.read_json(file.with_name("metrics.jsonl"), lines=True).set_index("episode")
             size = -(-len(lines) // POINTS)
             means = lines.groupby((np.arange(len(lines)) // size + 1) * size).mean()

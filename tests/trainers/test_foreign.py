@@ -22,6 +22,7 @@ from emberlink.trainers.comparison.reading import read_all
 from emberlink.trainers.evaluation.export import export
 from emberlink.trainers.evaluation.foreign import FOREIGN, OnnxPolicy, new_run, reference_of
 from emberlink.trainers.evaluation.policy import adopted, opened
+from emberlink.trainers.runs.pretrained import find
 
 WORLD = {"setup": "tuned", "horizon": 20, "num_uavs": 3, "evaluation.scripted": []}
 SOURCE = """
@@ -303,10 +304,7 @@ TINY = {
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("setup", ["tuned", "strong", "strong_front"])
-@pytest.mark.parametrize("method", ["consensus", "independent", "maps", "positional"])
-def test_pretrained_policies_as_onnx_files_act_alike_over_an_episode(setup, method, tmp_path):
-    if (setup, method) == ("tuned", "maps"):
-        method = "shared_memory"  # tuned has no maps
-    policy, onnx = exported(f"pretrained:{setup}/{method}", tmp_path)
+@pytest.mark.parametrize("name", sorted({"/".join(p.parts[-3:-1]) for p in find("pretrained:*")}))
+def test_pretrained_policies_as_onnx_files_act_alike_over_an_episode(name, tmp_path):
+    policy, onnx = exported(f"pretrained:{name}", tmp_path)
     check_same_actions(policy, onnx, 1000)

@@ -67,15 +67,13 @@ def in_world(config: RunConfig, world: str, **fire: Any) -> RunConfig:
         return config
     setup = f"setup={config.setup}"
     there = resolve(config.method, [setup, f"world={world}"], **fire)
-    here = [resolve(config.method, [setup, f"world={config.world}", "fire=paper"])]
-    if here[0].edition != config.edition:
-        # The file of the run's edition is gone: settings of the other world's own file also count.
-        here.append(resolve(config.method, [setup, "world=paper", "fire=paper"]))
-    origins = [flat(to_values(origin)) for origin in here]
-    values = to_values(config)
+    origin = resolve(config.method, [setup, f"world={config.world}", "fire=paper"])
+    if origin.edition != config.edition:
+        was = f"{config.world} was trained in edition {config.edition}, which is gone"
+        raise UserError(f"world={world}: {was}; known: {origin.edition}")
+    values, here = to_values(config), flat(to_values(origin))
     for key, value in flat(to_values(there)).items():
-        differs = any(value != origin.get(key) for origin in origins)
-        if key.startswith(("env.", "evaluation.")) and differs:
+        if key.startswith(("env.", "evaluation.")) and value != here.get(key):
             put(values, key, value)
     changed = from_values(values | {"world": world, "edition": there.edition})
     return replace(changed, fire=there.fire)

@@ -1,8 +1,8 @@
 """Opens the trained policies of the package (`pretrained:consensus`).
 
 Each is a reduced run folder, policies/pretrained/SETUP/METHOD/sSEED, with config.yaml,
-metrics.jsonl, eval.json, and a checkpoint of the actors. SETUP is `collection`: the setup, and the
-world if it is not `paper`. docs/experiments/pack_policies.py makes them of finished runs.
+metrics.jsonl, eval.json, and a checkpoint of the actors. SETUP is also a study, whose METHODs are
+its arms. docs/experiments/pack_policies.py makes them of finished runs.
 """
 
 import re
@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING
 from emberlink.envs.utils.errors import UserError, naming
 
 if TYPE_CHECKING:  # a wrong name is reported before torch is imported
-    from emberlink.trainers.config.schema import RunConfig
     from emberlink.trainers.runs.run_folder import RunFolder
 
 PREFIX = "pretrained:"
 _COPY = "pretrained"
 """beginning of the names of copies in an output folder"""
-USUAL_SETUPS = ("tuned", "strong_front")
+USUAL_SETUPS = ("tuned", "study_front")
 """where a method without a setup is looked for, in this order"""
 
 
@@ -33,7 +32,7 @@ def is_name(text: str) -> bool:
 def read_run(text: str) -> "RunFolder":
     """Returns the run of a folder, or of `pretrained:[SETUP/]METHOD[/SEED]`, to be read.
 
-    SETUP is such as `tuned` or, for the world front, `strong_front`.
+    SETUP is such as `tuned` or `study_front`.
     """
     from emberlink.trainers.runs.run_folder import RunFolder
 
@@ -90,11 +89,6 @@ def find_one(text: str) -> Path:
     if len(recipes) > 1:
         raise UserError(f"{text} is ambiguous: {', '.join(recipes)}")
     return policies[0]
-
-
-def collection(config: "RunConfig") -> str:
-    """Returns the folder of a run's trained policies: its setup, and its world unless `paper`."""
-    return config.setup if config.world == "paper" else f"{config.setup}_{config.world}"
 
 
 def _shipped() -> Path:
