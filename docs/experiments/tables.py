@@ -31,7 +31,6 @@ ROOT = Path(__file__).parents[2]
 DATA = ROOT / "docs" / "data"
 TEXTS = Path(__file__).with_suffix(".yaml")
 TABLE = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
-OF_ROW = ("measure", "fire", "value")
 POINTS = 40  # most of a learning curve: means of equal parts of a training
 
 
@@ -182,8 +181,7 @@ def gains(columns: dict[str, str], rows: dict[str, str], **_: str) -> Figure:
     for y, (value, ends) in enumerate(found.values()):
         axes.plot(ends or [value] * 2, [y, y], "|-", lw=2, ms=9, mew=1.5, color=drawing.COLOURS[0])
         axes.plot([value], [y], "o", ms=7, color=drawing.COLOURS[0])
-    names = [re.sub(r"`", "", name).replace(" | ", ": ", 1) for name in found]
-    axes.set_yticks(range(len(found)), [name.replace(" | ", ", ") for name in names])
+    axes.set_yticks(range(len(found)), [re.sub("`", "", x).replace(" | ", ", ") for x in found])
     axes.set(xlabel=f"gain of teams trained with messages, {[*columns][-1].split(', ')[1]}")
     axes.axvline(0, color="0.3", lw=1.3)
     axes.invert_yaxis()
@@ -254,7 +252,8 @@ def pack(name: str, *folders: str) -> None:
             part = means.rename_axis("episode").melt(var_name="measure", ignore_index=False)
             curves.append(part.dropna().reset_index().assign(run=label, seed=config["seed"]))
     table = [(*key, fire, x) for key, values in rows.items() for fire, x in enumerate(values)]
-    add(DATA / f"{name}.csv.xz", pd.DataFrame(table, columns=["run", "seed", *OF_ROW]))
+    columns = ["run", "seed", "measure", "fire", "value"]
+    add(DATA / f"{name}.csv.xz", pd.DataFrame(table, columns=columns))
     if curves:
         add(DATA / f"{name}.curves.csv.xz", pd.concat(curves))
         file = DATA / f"{name}.yaml"
@@ -266,10 +265,8 @@ def add(file: Path, table: Any) -> None:
     """Adds rows to a file."""
     if file.exists():
         table = pd.concat([pd.read_csv(file), table])
-    rows = table.astype({"seed": "Int64"}).drop_duplicates(
-        [*table.columns.drop("value")], keep="last"
-    )
-    rows.to_csv(file, index=False, float_format="%.6g")
+    rows = table.drop_duplicates([*table.columns.drop("value")], keep="last")
+    rows.astype({"seed": "Int64"}).to_csv(file, index=False, float_format="%.6g")
 
 
 def write() -> None:

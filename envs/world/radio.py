@@ -14,7 +14,8 @@ _AT_PLACE = 0.01  # of the range over the ground; distance at which a relay is a
 _SILENT = 150  # steps; a UAV not heard of for so long counts as lost where UAVs fail
 
 
-_HALF, _WIDTH = 0.75, 0.08  # of the range: where `fade` loses half of the messages, and how fast
+_HALF = 0.65  # of the range: where `fade` loses half of the messages; at the range it loses 90 %
+_STEEP = 5  # 1.7 (path loss exponent 2.79) 10 / (standard deviation of 4.05 dB · ln 10)
 
 
 class Channel(nn.Module):
@@ -144,8 +145,13 @@ class Late(nn.Module):
 
 
 def fade(far: Tensor) -> Tensor:
-    """Returns the probability that `env.radio.fade` loses a message; `far` is in ranges."""
-    return torch.sigmoid((far - _HALF) / _WIDTH)
+    """Returns the probability that `env.radio.fade` loses a message; `far` is in ranges.
+
+    The logistic curve, in decibels, of log-normal shadowing between a UAV and open or suburban
+    ground: exponents 2.54 to 3.04, deviations 2.79 to 5.3 dB (Khawaja et al., in table 2.2 of
+    Imran et al., Autonomous Airborne Wireless Networks, 2021).
+    """
+    return torch.sigmoid(_STEEP * (far / _HALF).log())
 
 
 def budget(config: RadioConfig, near: Tensor) -> Tensor | None:

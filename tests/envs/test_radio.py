@@ -68,7 +68,7 @@ def test_links_equal_those_of_each_pair_by_itself(seed, based, **radio):
                     lives = all(k == UAVS or alive[step, e, k] for k in (i, j))
                     heard = i != j and far < config.range and lives and not bad[e, i, j]
                     if heard and config.fade:
-                        chance = 1 / (1 + math.exp((0.75 - far / config.range) / 0.08))
+                        chance = far**5 / (far**5 + (0.65 * config.range) ** 5)
                         heard = pair(keys[e], step, two, side, i, j) >= chance
                     assert links[e, i, j] == heard
     at = torch.arange(6).unsqueeze(-1).expand(6, ENVS)
