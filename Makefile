@@ -88,7 +88,7 @@ tables: $(INSTALLED)  ## write the tables of the pages from docs/data
 	@$(BIN)/python docs/experiments/tables.py
 
 docs/replay.html: | $(INSTALLED)
-	@$(BIN)/emberlink render pretrained:consensus pretrained:consensus env.radio.range=0 --fire huygens:2 --output $@
+	@$(BIN)/emberlink render pretrained:study_front/maps pretrained:study_front/none --fire front:14 --output $@
 
 install: $(INSTALLED)  ## only create .venv
 

@@ -52,7 +52,7 @@ def test_a_command_stands_beside_each_figure():
         for block, after in zip(blocks, [*blocks[1:], ""], strict=True):
             for file in FIGURE.findall(block) if page.parent != ROOT else []:
                 assert (page.parent / file).is_file()
-                assert re.match(r"Made with `(emberlink|python) [^`]+`", after), file
+                assert re.match(r"Made with `(emberlink|python|make) [^`]+`", after), file
 
 
 @pytest.mark.slow
@@ -63,6 +63,13 @@ def test_a_command_stands_beside_each_figure():
 )
 def test_tables_are_those_of_the_data(page):
     assert tables.written(TEXTS[page]) == TEXTS[page]
+
+
+@pytest.mark.slow
+@pytest.mark.drawn
+def test_figures_are_those_of_the_data():
+    for name, figure in tables.figures().items():
+        assert (ROOT / f"docs/images/{name}.svg").read_text() == tables.svg(figure), "make tables"
 
 
 @pytest.mark.slow
