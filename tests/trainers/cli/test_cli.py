@@ -48,7 +48,7 @@ def test_eval_uses_the_given_checkpoint(run, capsys):
     assert min(again["learned"]["boundary_exits"]) > max(trained["learned"]["boundary_exits"])
     # The evaluation of the newest checkpoint still exists.
     assert (run / "eval.json").read_bytes() == newest
-    for figure in ("coverage_other.png", "timelapse_huygens_other.png"):
+    for figure in ("replay_other.html", "timelapse_huygens_other.png"):
         assert (run / "figures" / figure).exists()
 
 
