@@ -20,7 +20,7 @@ _FORMAT = r"^((day|month|year)_first|(milli)?seconds|.*%.*)$"
 _Text = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
-@dataclass(frozen=True, kw_only=True, config={**STRICT, "use_attribute_docstrings": True})
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class FileFireConfig:
     """Fires read from a file: a raster, perimeters, points of the front, or a bank."""
 
