@@ -72,12 +72,11 @@ def cell(row: str, column: str) -> str:
     """Returns the text of an expression; empty if its runs do not exist."""
     expression = row.replace("{}", column) if "{}" in row else column.replace("{}", row)
     value, ends = computed(expression) or (None, None)
-    if value is None:
-        return ""
-    if np.isnan(value):
-        return "undetermined"
-    digits = expression.split()[-1]
-    texts = [f"{x:,.{digits}f}".replace("-", "\N{MINUS SIGN}") for x in (value, *(ends or ()))]
+    if value is None or np.isnan(value):
+        return "" if value is None else "undetermined"
+    digits = int(expression.split()[-1])
+    numbers = [round(x, digits) + 0.0 for x in (value, *(ends or ()))]
+    texts = [f"{x:,.{digits}f}".replace("-", "\N{MINUS SIGN}") for x in numbers]
     return f"{texts[0]} [{texts[1]}, {texts[2]}]" if ends and ends[0] < ends[1] else texts[0]
 
 
