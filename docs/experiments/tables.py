@@ -65,7 +65,7 @@ def computed(expression: str) -> Any:
     """Returns the value of an expression and the ends of its interval, None without its runs."""
     function, *runs, measure, _ = expression.split()
     samples = [sample(*run.split("/"), measure) for run in runs]
-    return FUNCTIONS[function](samples, measure) if all(map(len, samples)) else None
+    return FUNCTIONS[function](samples, measure) if all(map(len, samples[:3])) else None
 
 
 def cell(row: str, column: str) -> str:
