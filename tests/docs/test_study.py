@@ -55,6 +55,12 @@ def test_the_numbers_of_the_study_by_hand():
     assert tables.rise([np.array([[0] * 12 + [10, 20, 30, 60]])], "")[0] == 45 - 15
 
 
+def test_a_claim_without_one_of_the_methods_is_computed():
+    runs = "strong/consensus strong/independent strong/positional strong/shared_memory"
+    assert tables.cell("{}", f"ratio {runs} coverage 2").startswith("1.00 [")
+    assert tables.cell("{}", "gain strong/consensus strong/nobody coverage 1") == ""
+
+
 def test_p_values_are_corrected_for_all_comparisons():
     rows = {"a": ["1.0", "0.01"], "b": ["", ""], "c": ["2.0", "0.02"]}
     lines = tables.table({"gain": "", "p": ""}, rows, holm="p").splitlines()
