@@ -194,14 +194,15 @@ def curves(study: str, labels: Sequence[str], measures: Sequence[str]) -> Figure
     for key in product(labels, measures):
         if key in every:
             points = every[key].pivot(index="seed", columns="fire", values="value")
-            values, middle = points.to_numpy(), bootstrap.iqm(points.to_numpy(), axis=0)
-            ends = bootstrap.interval(bootstrap.iqm, values, axis=0, resamples=2000)
+            values, draws = points.to_numpy(), bootstrap.BAND_RESAMPLES
+            ends = bootstrap.interval(bootstrap.iqm, values, axis=0, resamples=draws)
             about = {
                 "label": key[0],
                 "measure": key[1].rpartition("/")[2],
                 "episode": points.columns,
             }
             low, high = ends or (np.nan, np.nan)
+            middle = bootstrap.iqm(values, axis=0)
             rows.append(pd.DataFrame({**about, "iqm": middle, "low": low, "high": high}))
     none = pd.DataFrame(columns=["label", "measure", "iqm"])
     shown = [measure.rpartition("/")[2] for measure in measures]
