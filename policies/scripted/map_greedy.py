@@ -47,8 +47,6 @@ class MapGreedy(Searcher):
 
     hears: ClassVar[bool] = True
     messages: ClassVar[Messages] = "in range"
-    informs_base: ClassVar[bool] = False
-    """whether it brings sightings to a base"""
     TARGET: ClassVar[str] = "_map_greedy_target"
     flown: ClassVar[float] = 2.0
     claim: ClassVar[float] = 2.0
@@ -131,7 +129,6 @@ class Courier(MapGreedy):
     15 steps before the end. Without a base they search as `MapGreedy`.
     """
 
-    informs_base: ClassVar[bool] = True
     every: ClassVar[int | None] = None
     """steps from one chain to the next; None for one at the end of the episode"""
 

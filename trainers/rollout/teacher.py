@@ -38,6 +38,11 @@ class KnownMaps:
         self.reach = tensordict.get(keys.HEARS, nobody)
         self._last, self._state = self._maps.sightings()
 
+    @property
+    def heard(self) -> Tensor:
+        """The step of the latest news that each UAV (row) has of another one, [envs, n, n]."""
+        return self._maps.stamp.clamp(min=0)
+
     def last_seen(self) -> Tensor:
         """Returns the last step at which each UAV knows each cell seen, float [envs, n, X, Y]."""
         return self._last.float()
@@ -114,17 +119,13 @@ class Teacher(Transform):
 def find(name: str) -> type[MapGreedy]:
     """Returns the scripted policy of a name, which plans by the maps that UAVs share in range.
 
-    A policy that informs a base is none: with `comm.home`, UAVs come home by a rule.
-
     Raises:
         UserError: no teacher has this name; the message lists the known ones.
     """
     known = {
         other: policy
         for other, policy in ((other, SCRIPTED.find(other)) for other in SCRIPTED.known())
-        if issubclass(policy, MapGreedy)
-        and policy.messages == "in range"
-        and not policy.informs_base
+        if issubclass(policy, MapGreedy) and policy.messages == "in range"
     }
     if name not in known:
         raise UserError(f"learner.teacher={unknown(name, known)}")

@@ -28,7 +28,7 @@ COMMANDS = [
     ("sweep executor=slurm", ["executor='slurm' is not known; known: local"]),
     ("world check front evaluation.scripted=[oracle]", ["lacks random_way"]),
     ("train maps env.observation=vector", ["comm.name=maps exchanges the UAVs' maps"]),
-    (f"{IMITATE} learner.teacher=courier", ["known: map_greedy"]),
+    (f"{IMITATE} learner.teacher=oracle", ["known: courier, map_greedy, shuttle"]),
     (f"train independent output={NOWHERE}", HOME),
     (f"compare {NOWHERE}", HOME),
 ]
