@@ -14,6 +14,8 @@ CONTACT = 10
 """steps after its last message for which a radio counts as in range"""
 ACKNOWLEDGEMENT = 2
 """bytes of the number of a radio whose message was received"""
+_LACKING, _OPEN = 1, 2
+"""states of entries, see `Exchange.pending`"""
 _NOTHING = -2
 """the code of an entry that nobody has seen"""
 
@@ -46,7 +48,10 @@ class Exchange(nn.Module):
     """
 
     pending: Tensor
-    """bool [envs, r, items]: entries that a radio in range may lack"""
+    """int8 [envs, r, items]: 0 for entries that no radio in range lacks, `_OPEN` for those of which
+    something has changed since this was judged, `_LACKING` for other ones"""
+    rank: Tensor
+    """int32 [envs, r, items]: higher for entries to be said earlier within a limit, 0 for others"""
     contact: Tensor
     """bool [envs, r, r]: the radios (column) that were in range of a radio at the last step"""
     has: Tensor
@@ -54,7 +59,7 @@ class Exchange(nn.Module):
     told: Tensor
     """int32 [envs, r, items]: codes last said"""
     told_at: Tensor
-    """int64 [envs, r, items]: the steps at which they were said, -1 for never"""
+    """int32 [envs, r, items]: the steps at which they were said, -1 for never"""
     heard: Tensor
     """int64 [envs, r, r]: step of the last message that a radio (row) received, -1 for none"""
     got: Tensor
@@ -68,8 +73,6 @@ class Exchange(nn.Module):
     """int32 like `codes`: the steps, -1 for never"""
     acknowledged: Tensor
     """bool [envs, r, r]: the messages of a radio (row) that others acknowledged at the last step"""
-    waits: Tensor
-    """int64 [envs, r]: bytes of the entries that did not fit at the last step"""
     sizes: Tensor
     _first: Tensor
 
@@ -88,15 +91,14 @@ class Exchange(nn.Module):
         (envs, radios), self.shape = shape, (*shape, items)
         self.register_buffer("sizes", sizes, persistent=False)
         self.register_buffer("_first", own_maps(*self.shape), persistent=False)
-        self.register_buffer("pending", torch.zeros(self.shape, dtype=torch.bool))
+        self.register_buffer("pending", torch.zeros(self.shape, dtype=torch.int8))
+        self.register_buffer("rank", torch.zeros(self.shape, dtype=torch.int32))
         pairs = envs, radios, radios
-        waits = torch.zeros(pairs[:2], dtype=torch.int64)
-        self.register_buffer("waits", waits, persistent=False)
         for name in ("contact", "got", "acknowledged"):
             self.register_buffer(name, torch.zeros(pairs, dtype=torch.bool))
         self.register_buffer("heard", torch.full(pairs, -1))
         self.register_buffer("reached", torch.full((*pairs, radios), -1))
-        self.register_buffer("told_at", torch.full(self.shape, -1))
+        self.register_buffer("told_at", torch.full(self.shape, -1, dtype=torch.int32))
         nothing = torch.tensor(_NOTHING, dtype=torch.int32)
         self.register_buffer("told", nothing.repeat(self.shape))
         self.register_buffer("has", nothing.repeat(*self.shape, radios))
@@ -107,16 +109,26 @@ class Exchange(nn.Module):
 
     def start_episodes(self, mask: Tensor) -> None:
         """Forgets everything in the environments of a mask, bool [envs]."""
-        blank = {"pending": False, "contact": False, "got": False, "acknowledged": False}
+        blank = dict.fromkeys(("pending", "rank", "contact", "got", "acknowledged"), 0)
         blank |= dict.fromkeys(("heard", "reached", "told_at", "said_at"), -1)
-        blank |= {"told": _NOTHING, "has": _NOTHING}
+        blank |= dict.fromkeys(("told", "has"), _NOTHING)
         self.links.sent[mask] = False
         for name, value in blank.items():
             getattr(self, name)[mask] = value
 
+    @property
+    def waits(self) -> Tensor:
+        """The bytes of the entries that did not fit at the last step, int64 [envs, r]."""
+        return ((self.rank > 0) * self.sizes).sum(-1) * self.contact.any(-1)
+
     def saw(self, view: View) -> None:
         """Notes the cells that UAVs see at this step."""
-        mark(self.pending, view.cells + self._first[:, : view.cells.shape[1]], view.in_view)
+        index = view.cells + self._first[:, : view.cells.shape[1]]
+        self._reopen(index.view(-1), view.in_view.view(-1))
+
+    def _reopen(self, entry: Tensor, where: Tensor) -> None:
+        """Opens entries where a bool tensor is true."""
+        self.pending.view(-1).scatter_reduce_(0, entry, _OPEN * where.char(), "amax")
 
     def forward(
         self, known: Knowledge, hears: Tensor, step: Tensor, left: Tensor | None
@@ -161,7 +173,7 @@ class Exchange(nn.Module):
         self.said_at.view(-1)[sent] = step.int()[env]
         env, radio = heard.nonzero(as_tuple=True)
         row = (env * slots + ((step + 1) % slots)[env]) * radios + radio
-        then = (step - self.config.delay)[env].unsqueeze(-1)
+        then = (step - self.config.delay).int()[env].unsqueeze(-1)
         sent = _marked(self.said_at.view(-1, items).index_select(0, row) == then, row)
         return sent, self.codes.view(-1)[sent]
 
@@ -172,37 +184,43 @@ class Exchange(nn.Module):
         radios, items = self.shape[1:]
         contact = _lately(self.heard, step.view(-1, 1, 1))
         met = (contact & ~self.contact).any(-1)
-        self.pending[met] = known.last_seen[met] >= 0
+        other = (contact != self.contact).any(-1)
+        self.pending[other] = _OPEN * self.pending[other].clamp(max=1)
+        self.pending[met] = _OPEN * (known.last_seen[met] >= 0).char()
         self.contact.copy_(contact)
-        row = contact.any(-1).view(-1).nonzero().squeeze(-1)
-        entry = _marked(self.pending.flatten(0, 1).index_select(0, row), row)
+        active = contact.any(-1).view(-1).nonzero().squeeze(-1)
+        entry = _marked(self.pending.flatten(0, 1)[active] == _OPEN, active)
         row = entry // items
         mine, theirs = codes(known, entry), self.has.view(-1, radios)[entry]
-        now = step[row // radios]
+        now = step.int()[row // radios]
         told, at = self.told.view(-1)[entry], self.told_at.view(-1)[entry]
         due = (at == now - self.wait).nonzero().squeeze(-1)
         back = self.acknowledged.flatten(0, 1)[row[due]]
         after = merged(theirs[due], torch.where(back, told[due].unsqueeze(-1), _NOTHING))
         self.has.view(-1, radios)[entry[due]] = theirs[due] = after
-        told = torch.where((at >= 0) & (now - at < self.wait), told, _NOTHING)
-        spent, left = self._open(left)
+        waits = (at >= 0) & (now - at < self.wait)
+        told = torch.where(waits, told, _NOTHING)
         lacks = contact.flatten(0, 1)[row] & newer(mine.unsqueeze(-1), theirs)
         wanted = lacks.any(-1)
-        self.pending.view(-1)[entry] = wanted
-        says = (wanted & (told != mine)).nonzero().squeeze(-1)
-        size = self.sizes[entry % items]
-        if left is not None:
-            waits = self.waits.zero_().view(-1)
-            waits.index_add_(0, row[says], size[says])
-            says = says[(size <= left.view(-1)[row])[says]]
-            expected = merged(theirs[says], told[says].unsqueeze(-1))
-            gain = (self._gain(mine[says].unsqueeze(-1), expected) * lacks[says]).sum(-1)
-            says = says[self._fits(entry[says], gain, size[says], left.view(-1))]
-            waits.index_add_(0, row[says], size[says], alpha=-1)
-        entry, mine = entry[says], mine[says]
+        self.pending.view(-1)[entry] = wanted * torch.where(waits, _OPEN, _LACKING).char()
+        says = wanted & (told != mine)
+        spent, left = self._open(left)
+        if left is None:
+            entry, mine = entry[says], mine[says]
+        else:
+            expected = merged(theirs, told.unsqueeze(-1))
+            gain = (self._gain(mine.unsqueeze(-1), expected) * lacks).sum(-1)
+            # The order of equal gains depends on the radio, so that radios say different entries.
+            turned = (entry + row % radios * (items // radios)) % items
+            self.rank.view(-1)[entry] = (says * ((gain + 1) * items - turned)).int()
+            entry = self._best(active, left)
+            self.rank.view(-1)[entry] = 0
+            mine = codes(known, entry)
+        row = entry // items
+        self.pending.view(-1)[entry] = _OPEN  # until it is acknowledged or said again
         self.told.view(-1)[entry] = mine
-        self.told_at.view(-1)[entry] = now[says]
-        sent = spent.view(-1).index_add(0, row[says], size[says]).view_as(spent)
+        self.told_at.view(-1)[entry] = step.int()[row // radios]
+        sent = spent.view(-1).index_add(0, row, self.sizes[entry % items]).view_as(spent)
         return entry, mine, sent
 
     def _open(self, left: Tensor | None) -> tuple[Tensor, Tensor | None]:
@@ -224,22 +242,14 @@ class Exchange(nn.Module):
         before = torch.where(mine & 1 > theirs & 1, -1, theirs >> self.bits)
         return ((mine >> self.bits) - before).clamp(0, OLD)
 
-    def _fits(self, entry: Tensor, gain: Tensor, size: Tensor, left: Tensor) -> Tensor:
-        """Returns which entries are said: by falling gain, as many as fit, bool [k].
-
-        The order of equal gains depends on the radio's number, so that radios say different
-        entries.
-        """
-        radios, items = self.shape[1:]
-        row, most = entry // items, radios * OLD
-        turned = (entry % items + row % radios * (items // radios)) % items
-        order = ((row * (most + 1) + most - gain) * items + turned).argsort()
-        total, row = size[order].cumsum(0), row[order]
-        count = row.bincount(minlength=len(left))
-        before = nn.functional.pad(total, (1, 0))[count.cumsum(0) - count]
-        fits = torch.empty_like(order, dtype=torch.bool)
-        fits[order] = total - before[row] <= left[row]
-        return fits
+    def _best(self, row: Tensor, left: Tensor) -> Tensor:
+        """Returns the entries of the highest ranks in rows of maps, as many as the bytes allow."""
+        items = self.shape[2]
+        most = min(int(left.max()) // int(self.sizes.min()), items)
+        left, rank = left.view(-1, 1)[row], self.rank.flatten(0, 1)[row]
+        rank, item = torch.where(self.sizes <= left, rank, 0).topk(most)
+        says = (rank > 0) & (self.sizes[item].cumsum(-1) <= left)
+        return (item + items * row.unsqueeze(-1))[says]
 
     def _listen(
         self, known: Knowledge, entry: Tensor, code: Tensor, arrives: Tensor, passes: Tensor
@@ -255,7 +265,8 @@ class Exchange(nn.Module):
         target = (env * radios * items + cell)[which] + hearer * items
         code, last, seen = code[which], known.last_seen, known.seen_fire
         changed = newer(code, codes(known, target))
-        self.pending.view(-1)[target[changed & passes[env[which], hearer, speaker[which]]]] = True
+        passed = changed & passes[env[which], hearer, speaker[which]]
+        self._reopen(target, passed | (self.pending.take(target) > 0))
         assert seen is not None
         last.view(-1).scatter_reduce_(0, target, (code >> 1).to(last.dtype), "amax")
         mark(seen, target, (code & 1) > 0)
