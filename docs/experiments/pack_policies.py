@@ -1,4 +1,4 @@
-"""Adds finished runs to the trained policies that are installed, or puts seeds in one archive.
+"""Adds finished runs to the trained policies that are installed, or to an archive.
 
 python docs/experiments/pack_policies.py RUN... policies/pretrained/tuned/consensus
 python docs/experiments/pack_policies.py RUN... docs/weights/ARM.tar.xz   # rounded to 16 bits
@@ -51,16 +51,19 @@ def pack(run: RunFolder, target: Path, *, half: bool = False) -> Path:
 
 
 def main(*texts: str) -> None:
-    """Packs runs into a folder or an archive, each as sSEED."""
+    """Packs runs into a folder or an archive, each as sSEED beside those that are there."""
     runs, into = [RunFolder(text) for text in texts[:-1]], Path(texts[-1])
-    half = into.suffix == ".xz"
+    half, arm = into.suffix == ".xz", into.name.partition(".")[0]
     with TemporaryDirectory() as scratch:
-        folder = Path(scratch) if half else into
+        if half and into.exists():
+            with tarfile.open(into) as archive:
+                archive.extractall(scratch, filter="data")
+        folder = Path(scratch) / arm if half else into
         for run in runs:
             pack(run, folder / f"s{run.config(device='cpu').seed}", half=half)
         if half:
-            with tarfile.open(into, "x:xz") as archive:
-                archive.add(folder, into.name.partition(".")[0])
+            with tarfile.open(into, "w:xz") as archive:
+                archive.add(folder, arm)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,9 @@
 import json
 import runpy
 import shutil
+import tarfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -11,6 +13,7 @@ import yaml
 from refusal import refused
 from tiny_run import TINY
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import flat, to_values
 from emberlink.trainers.evaluation.policy import load_actor
@@ -21,6 +24,7 @@ PACKED = (("consensus", 3, "paper"), ("positional", 1, "front"))
 FOLDERS = ("tuned/consensus/s3", "tuned_front/positional/s1")
 
 SCRIPT = Path(__file__).parents[3] / "docs/experiments/pack_policies.py"
+FILES = ("checkpoint.safetensors", "config.yaml")
 packed_in = runpy.run_path(str(SCRIPT))["main"]
 
 
@@ -41,6 +45,20 @@ def packed(tmp_path_factory) -> tuple[Path, list[Path]]:
     for name in ("consensus/s10", "independent/s3"):
         shutil.copytree(root / FOLDERS[0], root / "tuned" / name)
     return root, runs
+
+
+def test_seeds_are_added_to_an_archive(packed, tmp_path):
+    archive, read = tmp_path / "arm.tar.xz", []
+    for run in packed[1]:
+        packed_in(str(run), str(archive))
+        with tarfile.open(archive) as members:
+            files: Any = [(file.name, members.extractfile(file)) for file in members]
+            read.append({name: file.read() for name, file in files if file})
+    names = [f"arm/s{seed}/{file}" for seed in (1, 3) for file in FILES]
+    assert [sorted(content) for content in read] == [names[2:], names]
+    assert read[1].items() >= read[0].items()
+    with pytest.raises(UserError, match="s3: exists already"):
+        packed_in(str(packed[1][0]), str(archive))
 
 
 @pytest.fixture
