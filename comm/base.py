@@ -136,7 +136,7 @@ class CommModule(TensorDictModuleBase):
         return self.show(last), _stacked(bonus), _stacked(sent)
 
     def rewrite(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Enters what the UAVs see into their maps, if they have any, and calls `forward`."""
+        """Enters the UAVs' sightings into their maps, if they have any, and calls `forward`."""
         if self.maps is not None:
             self.maps.look(tensordict)
         return self(tensordict)

@@ -22,7 +22,7 @@ from emberlink.trainers.runs.run_folder import NEWEST, RunFolder
 
 
 def reduced(run: RunFolder) -> RunConfig:
-    """Returns the configuration of a finished run without what is of one machine."""
+    """Returns the configuration of a finished run without settings of one machine."""
     trained = run.config(device="cpu")
     learner: Any = trained.learner
     if (start := getattr(learner, "warm_start", "")) and not is_name(start):

@@ -83,7 +83,7 @@ def draw(found: dict, policies: list[str], changes: list[str], path: Path) -> No
 
 
 def main(name: str, *words: str) -> None:
-    """Plays what is missing, radio by radio, and draws the figure."""
+    """Plays the missing radios one by one, and draws the figure."""
     torch.set_num_threads(1)
     policies, changes = ([w for w in words if ("=" in w) == given] for given in (False, True))
     path = Path(f"{name}.jsonl")

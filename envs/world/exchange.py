@@ -24,14 +24,14 @@ class Exchange(nn.Module):
     """Lets radios say the entries of their maps that others lack.
 
     A radio says an entry if a radio in range has no look at it, has an older one, or does not know
-    that it was seen while it burned. What it receives, it passes on from the next step on.
+    that it was seen while it burned. It passes on received entries from the next step on.
 
     An entry that it has heard is left to the speaker, unless it is in contact with a radio whose
     messages the speaker is not known to have acknowledged lately: else each radio of a clique would
     tell all others what one has told.
 
-    A radio knows of others what it hears: who was in range lately, what a radio has said, and which
-    messages it has acknowledged. An acknowledgement is part of the next message, so that an entry
+    A radio knows others from their messages alone: who was in range lately, which entries a radio
+    has said, and which messages it has acknowledged. An acknowledgement is part of the next message, so that an entry
     is said again `2 delay + 2` steps later if none has come.
 
     Within a limit of bytes, the entries of the highest gain are said: the steps by which the looks
@@ -224,7 +224,7 @@ class Exchange(nn.Module):
         return entry, mine, sent
 
     def _open(self, left: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Returns the bytes of headers and acknowledgements, and what is left, int64 [envs, r].
+        """Returns the bytes of headers and acknowledgements, and the bytes left, int64 [envs, r].
 
         Acknowledgements that do not fit are dropped.
         """

@@ -1,4 +1,4 @@
-"""Writes the policy of a run as an ONNX file, with a card of what it reads and does."""
+"""Writes the policy of a run as an ONNX file, with a card of its inputs and outputs."""
 
 import json
 import logging
