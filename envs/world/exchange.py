@@ -31,8 +31,8 @@ class Exchange(nn.Module):
     tell all others what one has told.
 
     A radio knows others from their messages alone: who was in range lately, which entries a radio
-    has said, and which messages it has acknowledged. An acknowledgement is part of the next message, so that an entry
-    is said again `2 delay + 2` steps later if none has come.
+    has said, and which messages it has acknowledged. An acknowledgement is part of the next
+    message, so that an entry is said again `2 delay + 2` steps later if none has come.
 
     Within a limit of bytes, the entries of the highest gain are said: the steps by which the looks
     of the radios in range get newer, at most `OLD` each.
