@@ -244,11 +244,14 @@ class Exchange(nn.Module):
 
     def _best(self, row: Tensor, left: Tensor) -> Tensor:
         """Returns the entries of the highest ranks in rows of maps, as many as the bytes allow."""
-        items = self.shape[2]
-        most = min(int(left.max()) // int(self.sizes.min()), items)
-        left, rank = left.view(-1, 1)[row], self.rank.flatten(0, 1)[row]
-        rank, item = torch.where(self.sizes <= left, rank, 0).topk(most)
-        says = (rank > 0) & (self.sizes[item].cumsum(-1) <= left)
+        items, least = self.shape[2], int(self.sizes.min())
+        # Where the smallest entry fits, at most all the larger ones are passed over.
+        most = int(left.max()) // least + int((self.sizes > least).sum())
+        left = left.view(-1, 1)[row]
+        rank, item = self.rank.flatten(0, 1)[row].topk(min(most, items))
+        size = self.sizes[item]
+        size *= (rank > 0) & (size <= left)
+        says = (size > 0) & (size.cumsum(-1) <= left)
         return (item + items * row.unsqueeze(-1))[says]
 
     def _listen(
