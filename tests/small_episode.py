@@ -52,7 +52,7 @@ def play_small(*overrides: str) -> Episode:
     fire = with_burn_time(arrival, burn_time)
     env = build_env(config, num_envs=2, fire=fire, seed=seed, device="cpu")
     world: Any = env.base_env
-    recorder = Recorder(member=member)
+    recorder = Recorder(member)
     episode = Episode(config, None, arrival=arrival[member], burn_out=arrival[member] + burn_time)
     td = returned = env.reset()
     action = torch.zeros(2, config.env.num_uavs, 3)

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -14,14 +13,13 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import is_index, shown
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.base import SCRIPTED
-from emberlink.trainers.build import build_env
 from emberlink.trainers.config.basics import MAX_FIRES
-from emberlink.trainers.config.schema import RunConfig, build_comm
+from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.evaluate import (
     BLOCK,
     START_SEED,
     evaluation_scenarios,
-    play,
+    play_blocks,
     scripted_config,
     shown_scenario,
 )
@@ -43,28 +41,13 @@ class Panel:
     def play(self, arrival: Tensor, index: int) -> Episode:
         """Plays and records episode `index` of the evaluation on a fire, [1, X, Y].
 
-        As many environments are stepped as in an evaluation, so that the numbers are the same to
+        It has the same place in its batch as in an evaluation, so that the numbers are the same to
         the last bit.
         """
-        env = build_env(
-            self.config,
-            num_envs=BLOCK,
-            fire=arrival.expand(BLOCK, *arrival.shape[1:]),
-            seed=[START_SEED + index] * BLOCK,
-            device=self.config.device,
-        )
-        world: Any = env.base_env
-        policy = self.policy(world)
-        recorder = recorder_of(self.config, policy, index % BLOCK)
-        play(env, policy, recorder.add)
+        recorder = Recorder(index % BLOCK)
+        seed = START_SEED + index - recorder.member
+        play_blocks(self.config, self.policy, arrival, start_seed=seed, watch=recorder.add)
         return Episode(title=self.title, recording=recorder.recording())
-
-
-def recorder_of(config: RunConfig, policy: Any, member: int = 0) -> Recorder:
-    """Returns a recorder of a policy's episode in environment `member`."""
-    written = build_comm(config, 1).out_keys
-    advised = any(key in written for key in getattr(policy, "in_keys", ()))
-    return Recorder(policy, member=member, advised=advised)
 
 
 def title_of(config: RunConfig, *more: str) -> str:

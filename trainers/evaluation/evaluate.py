@@ -42,9 +42,9 @@ BLOCK = 50
 """environments in a batch of an evaluation, even if fewer episodes are needed"""
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
-Watch = Callable[[TransformedEnv, TensorDictBase], None]
-"""called at each step, from 0 to the horizon, with the environments and their output: the result
-of the reset, or the "next" of the step"""
+Watch = Callable[[TransformedEnv, TensorDictBase, Policy], None]
+"""called at each step, from 0 to the horizon, with the environments, their output (the result of
+the reset, or the "next" of the step), and the policy"""
 
 
 def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dict[str, Tensor]:
@@ -62,7 +62,7 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
     with torch.no_grad():
         td = env.reset()
         if watch is not None:
-            watch(env, td)
+            watch(env, td, policy)
         for _ in range(world.max_steps):
             td = env.step(policy(td))
             actions.append(td.get(keys.ACTION))
@@ -71,7 +71,7 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
                 sent = policy.bytes_sent(after)  # its messages, not the method's
                 after.update({} if sent is None else {keys.BYTES_SENT: sent})
             if watch is not None:
-                watch(env, after)
+                watch(env, after, policy)
             steps.append(metrics.measured_steps(after.unsqueeze(1)))
             td = step_mdp(td, keep_other=True)
     if not torch.stack(actions).isfinite().all():

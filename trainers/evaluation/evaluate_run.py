@@ -14,12 +14,12 @@ from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError, naming
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate, figures
-from emberlink.trainers.evaluation.episodes import recorder_of, title_of
+from emberlink.trainers.evaluation.episodes import title_of
 from emberlink.trainers.evaluation.foreign import FOREIGN, foreign_name, is_reference, new_run
 from emberlink.trainers.evaluation.policy import TrainedPolicy, adopted, load_policy
 from emberlink.trainers.evaluation.scores import LEARNED, Results, print_results, reporter
 from emberlink.trainers.replay.page import Replay
-from emberlink.trainers.replay.recording import Episode
+from emberlink.trainers.replay.recording import Episode, Recorder
 from emberlink.trainers.replay.screen import Screen, even_steps
 from emberlink.trainers.runs.checkpoint import read_header, versions
 from emberlink.trainers.runs.pretrained import open_run, read_run
@@ -82,7 +82,7 @@ def evaluate_run(
         run.figures()  # an unusable folder is an error before the episodes, not after
     config, checkpoint = policy.config, policy.checkpoint
     fires = fires or config.evaluation.episodes
-    recorder = recorder_of(config, policy)
+    recorder = Recorder()
     play, failed = partial(evaluate.evaluate, config, fires=fires, report=report), ""
     try:
         results = play(policy.actor, watch=recorder.add)

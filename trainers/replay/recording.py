@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 
+from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.world.exchange import Exchange
@@ -119,23 +120,24 @@ class Episode:
 
 
 class Recorder:
-    """Records the episode of one environment; `add` is called at each step.
+    """Records the episode of the environment with index `member`; `add` is called at each step.
 
-    It computes views and links again, which the environment does not show. `policy` may exchange
-    messages by itself; `member` is the index of the environment; `advised` tells whether the policy
-    reads the advice of the communication.
+    It computes views and links again, which the environment does not show.
     """
 
-    def __init__(self, policy: Any = None, *, member: int = 0, advised: bool = True):
-        self._policy, self._member, self._advised = policy, member, advised
-        self._hears = getattr(policy, "hears", False)
+    def __init__(self, member: int = 0):
+        self.member = member
         self._steps: dict[str, list[NDArray[Any]]] = {}
 
-    def add(self, env: TransformedEnv, td: TensorDictBase) -> None:
-        """Adds one step, at which the environments returned `td`: of a reset, or its "next"."""
-        now: Any = td[self._member : self._member + 1].cpu()
+    def add(self, env: TransformedEnv, td: TensorDictBase, policy: Any = None) -> None:
+        """Adds one step, at which the environments returned `td`: of a reset, or its "next".
+
+        `policy` may exchange messages by itself. The advice of the communication is recorded if the
+        policy reads it, or is None.
+        """
+        now: Any = td[self.member : self.member + 1].cpu()
         if not self._steps:
-            self._start(env)
+            self._start(env, policy)
         wanted = {"position": keys.POSITION, "alive": keys.ALIVE, **COUNTS, **OF_BASE}
         if self._advised:
             self._hears |= now.get(keys.HEARS, None) is not None
@@ -156,14 +158,17 @@ class Recorder:
             world=self._config, listens=listens, ignition=ignition, end=end, steps=steps
         )
 
-    def _start(self, env: TransformedEnv) -> None:
+    def _start(self, env: TransformedEnv, policy: Any) -> None:
         """Takes the fire of the environment, and finds the radios."""
         world: Any = env.base_env
-        parts = nn.ModuleList([env, *([self._policy] if self._policy else ())]).modules()
+        parts = [*nn.ModuleList([env] if policy is None else [env, policy]).modules()]
         self._exchanges = [part for part in parts if isinstance(part, Exchange)]
+        comm = next(part for part in parts if isinstance(part, CommModule))
+        self._advised = policy is None or any(key in comm.out_keys for key in policy.in_keys)
+        self._hears = getattr(policy, "hears", False)
         self._config, self._sensor = world.config, Sensor.of(world.config)
-        arrival, burn_out = world.arrival_time[self._member].cpu(), world.burn_out
-        end = torch.full_like(arrival, torch.inf) if burn_out is None else burn_out[self._member]
+        arrival, burn_out = world.arrival_time[self.member].cpu(), world.burn_out
+        end = torch.full_like(arrival, torch.inf) if burn_out is None else burn_out[self.member]
         self._whole = [whole_steps(times.cpu(), world.config.horizon) for times in (arrival, end)]
         self._channel = Channel(world.config, 1, base=world.config.base is not None)
 
@@ -180,7 +185,7 @@ class Recorder:
             says = nn.functional.pad(says, (0, near.shape[1] - says.shape[2]), value=True)
             near, hears = near & says, hears & says
             uavs, none = alive.shape[1], torch.zeros_like(alive, dtype=torch.int64)
-            waits = (one.waits[self._member, :uavs].cpu() for one in self._exchanges)
+            waits = (one.waits[self.member, :uavs].cpu() for one in self._exchanges)
             found["waits"] = sum(waits, none)
         found |= {"hears": hears, "lost": near & ~hears}
         if self._config.sensor != (1.0, 1.0):
