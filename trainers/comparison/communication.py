@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from emberlink.envs import metrics
 from emberlink.trainers.comparison import bootstrap
+from emberlink.trainers.comparison.bootstrap import Values
 from emberlink.trainers.comparison.reading import RADIO, Run
 from emberlink.trainers.comparison.tables import WARM_START, Frame, radio_text, trained_with
 from emberlink.trainers.evaluation.scores import LEARNED
@@ -21,8 +21,8 @@ _SAME = {"map_greedy": ("map_greedy_alone", "map_greedy_all")}
 without a base"""
 _OF_LEARNERS = ("env.reward.", "env.observation", "env.measures")
 """beginnings of the keys of `env` that do not change what scripted policies do"""
-_OFF, _FULL = ((reach, *[None] * (len(RADIO) - 1)) for reach in (0.0, float("inf")))
-"""values of `RADIO`; None where it has no effect"""
+_OFF, _FULL = "off", "no limits"
+"""texts of `radio_text`"""
 COLUMNS = (
     *("section", "fires", "label", "measure", "radios", "none", "with_radio", "full"),
     *("gain", "gain_low", "gain_high", "value", "value_low", "value_high"),
@@ -33,7 +33,6 @@ policy. `none`, `with_radio` and `full` are means with the radio off, with the w
 without limits; `gain` is with_radio - none, `value` is gain / (full - none), missing where the
 interval of full - none is not above 0 (below, if less is better)."""
 
-Values = NDArray[np.float64]
 Group = list[Run]
 """the runs of a label"""
 
@@ -62,13 +61,14 @@ Found = Iterator[tuple[str, str, str, list[Values]]]
 
 def _of_networks(groups: Mapping[str, Group], fires: str) -> Found:
     for label, group in groups.items():
-        if group[0].evaluated_with or _radio(group[0]) in (_OFF, _FULL):
+        if group[0].evaluated_with or radio_text(group[0].now) in (_OFF, _FULL):
             continue
         measure = group[0].headline
         for how, same in (("evaluated", _evaluated), ("retrained", _retrained)):
-            alike = {_radio(o[0]): o for o in [*groups.values()][::-1] if same(group, o)}
-            if none := alike.get(_OFF):
-                found = [none, group, *([alike[_FULL]] if _FULL in alike else [])]
+            others = [other for other in groups.values() if same(group, other)]
+            alike = {radio_text(other[0].now): other for other in others[::-1]}
+            if _OFF in alike:
+                found = [alike[_OFF], group, *([alike[_FULL]] if _FULL in alike else [])]
                 played = [[run.evaluation.results[fires][LEARNED] for run in one] for one in found]
                 yield label, measure, how, [np.array([p[measure] for p in one]) for one in played]
 
@@ -76,29 +76,20 @@ def _of_networks(groups: Mapping[str, Group], fires: str) -> Found:
 def _of_scripted(groups: Mapping[str, Group], fires: str) -> Found:
     """Yields scripted policies; without a base no evaluation with another radio is needed."""
     trained = [group[0] for group in groups.values() if not group[0].evaluated_with]
-    limited = {_radio(run): run for run in trained[::-1] if _radio(run) not in (_OFF, _FULL)}
-    for policy, world in product(SCRIPTED, limited.values()):
-        alike = [run for runs in groups.values() for run in runs if _world(run) == _world(world)]
-        none, full = (next((r for r in alike if _radio(r) == x), None) for x in (_OFF, _FULL))
-        choices = [(none, policy), (world, policy), (full, policy)]
+    every = [run for group in groups.values() for run in group]
+    limited = {radio_text(run.now): run for run in trained[::-1]}
+    limited = {radio: run for radio, run in limited.items() if radio not in (_OFF, _FULL)}
+    for policy, (radio, world) in product(SCRIPTED, limited.items()):
+        alike = {radio_text(r.now): r for r in every[::-1] if _world(r) == _world(world)}
+        choices = [(alike.get(_OFF), policy), (world, policy), (alike.get(_FULL), policy)]
         if world.settings.get("env.base") is None and policy in _SAME:
             off, unlimited = _SAME[policy]
             choices = [(world, off), (world, policy), (world, unlimited)]
         played = [run and run.evaluation.results[fires].get(name) for run, name in choices]
         measured = [np.array([p[world.headline]]) for p in played if p and world.headline in p]
         if len(measured) == len(choices):
-            several = f", {radio_text(world.now)}" if len(limited) > 1 else ""
+            several = f", {radio}" if len(limited) > 1 else ""
             yield policy.replace("_", " ") + several, world.headline, "scripted", measured
-
-
-def _radio(run: Run) -> tuple[Any, ...]:
-    """Returns the radio of a run's evaluation, as `_OFF`."""
-    reach, loss, bandwidth, burst, *more = (run.now.get(key) for key in RADIO)
-    reach = float("inf") if reach is None else float(reach)
-    burst = burst if loss and burst != 1 else None
-    return (
-        _OFF if reach == 0 else (reach, loss or None, bandwidth, burst, *(x or None for x in more))
-    )
 
 
 def _evaluated(group: Group, other: Group) -> bool:

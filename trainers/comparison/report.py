@@ -62,14 +62,6 @@ class Table(NamedTuple):
     rows: Frame
 
 
-Picture = dict[str, str]
-
-
-def _picture(png: bytes, caption: str) -> Picture:
-    """Returns a picture as a data URI, and its caption."""
-    return {"uri": f"data:image/png;base64,{base64.b64encode(png).decode()}", "caption": caption}
-
-
 def tables(comparison: Comparison, section: str) -> list[Table]:
     """Returns the tables of a section: rankings, the value of communication, claims."""
     ranking, gains, claims = (
@@ -189,13 +181,14 @@ def write_report(
     source = files("emberlink.trainers.comparison").joinpath("page.html").read_text("utf-8")
     contents: dict[str, bytes] = {}
 
-    def saved(chapter: int, figure: Figure, name: str, caption: str) -> Picture:
+    def saved(chapter: int, figure: Figure, name: str, caption: str) -> dict[str, str]:
         for kind, changing in (("png", "Software"), ("pdf", "CreationDate"), ("svg", "Date")):
             if kind == "png" or kind in extras:
                 file = BytesIO()
                 figure.savefig(file, format=kind, dpi=120, metadata={changing: None})
                 contents[f"{chapter}_{name}.{kind}"] = file.getvalue()
-        return _picture(contents.pop(f"{chapter}_{name}.png"), caption)
+        png = base64.b64encode(contents.pop(f"{chapter}_{name}.png")).decode()
+        return {"uri": f"data:image/png;base64,{png}", "caption": caption}
 
     chapters = []
     for place, section in enumerate(comparison.sections, 1):
@@ -224,7 +217,7 @@ def _chapter(
     comparison: Comparison,
     section: str,
     folder: Path,
-    saved: Callable[[Figure, str, str], Picture],
+    saved: Callable[[Figure, str, str], dict[str, str]],
 ) -> dict[str, Any]:
     """Draws the figures of a section, and returns its part of the page."""
     runs, ranking, curves = (
