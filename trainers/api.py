@@ -180,8 +180,8 @@ def load(
     Raises:
         UserError: there is no such run, a file in it is damaged, or a setting does not fit.
     """
-    name, file = os.fspath(run), None if checkpoint is None else user_path(checkpoint)
-    folder = pretrained.read_run(name)
+    file = None if checkpoint is None else user_path(checkpoint)
+    folder = pretrained.read_run(os.fspath(run))
     return load_policy(folder, (), settings, checkpoint=file, device=device)
 
 

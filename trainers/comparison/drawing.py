@@ -2,6 +2,7 @@
 
 import textwrap
 from collections.abc import Sequence
+from itertools import cycle
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -58,7 +59,7 @@ def training(
     have the colours of `frozen`.
     """
     has_curve = set(curves["label"])
-    colours = {label: colour for label, colour in _colours(labels).items() if label in has_curve}
+    colours = {label: c for label, c in zip(labels, cycle(COLOURS)) if label in has_curve}
     dashes = _dashes(scripted)
     lines = len(dashes) + sum(1 + _wrapped(name).count("\n") for name in colours)
     figure = Figure(figsize=(10.8, max(3.8, 0.4 + 0.2 * lines)), layout="constrained")
@@ -88,7 +89,7 @@ def frozen(ranking: Frame, labels: Sequence[str]) -> Figure:
     learned, scripted = ranking[is_learned], ranking[~is_learned]
     first = ranking["measure"].iloc[0]
     order = list(learned[learned["measure"] == first]["label"])[::-1]
-    colours, dashes = _colours(labels), _dashes(scripted)
+    colours, dashes = dict(zip(labels, cycle(COLOURS))), _dashes(scripted)
     names = [_wrapped(name) for name in order]
     tall = sum(0.14 + 0.2 * (1 + name.count("\n")) for name in names)
     measures = [m for m in dict.fromkeys([first, *FROZEN]) if m in set(ranking["measure"])]
@@ -119,17 +120,12 @@ def _wrapped(label: str) -> str:
     return textwrap.fill(label, 34, break_on_hyphens=False)
 
 
-def _colours(labels: Sequence[str]) -> dict[str, str]:
-    """Returns the colour of each label."""
-    return {label: COLOURS[i % len(COLOURS)] for i, label in enumerate(labels)}
-
-
 def _dashes(scripted: Frame) -> dict[str, Any]:
     """Returns the line of each scripted policy."""
     style = {"color": "0.3", "lw": 1.3, "zorder": 1}
     return {
-        name: {**style, "ls": DASHES[i % len(DASHES)], "label": _wrapped(f"scripted: {name}")}
-        for i, name in enumerate(sorted(scripted["label"].unique()))
+        name: {**style, "ls": dash, "label": _wrapped(f"scripted: {name}")}
+        for name, dash in zip(sorted(scripted["label"].unique()), cycle(DASHES))
     }
 
 

@@ -13,15 +13,13 @@ from typing import Any
 import pandas as pd
 
 from emberlink.trainers.comparison.reading import RADIO, LeftOut, Run
+from emberlink.trainers.config.schema import NOT_LEARNT_WITH
 from emberlink.trainers.config.values import flat
 from emberlink.trainers.evaluation.scores import LEARNED
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import without_time_and_seed
 
-NOT_COMPARED = (
-    *("seed", "output", "evaluation", "device", "logger"),
-    *("checkpoint_interval", "checkpoint_steps"),
-)
+NOT_COMPARED = ("seed", "output", "evaluation", *NOT_LEARNT_WITH)
 """first parts of keys that do not affect training"""
 WARM_START = "learner.warm_start"
 _FIRST = ("learner.name", "policy.memory")

@@ -50,15 +50,6 @@ class Panel:
         return Episode(title=self.title, recording=recorder.recording())
 
 
-def title_of(config: RunConfig, *more: str) -> str:
-    """Returns the title of a run, with changed settings; the world is named anyway."""
-    world = [] if config.world == "paper" else [f"world {config.world}"]
-    changes = [text for text in more if not text.startswith("world=")]
-    return ", ".join(
-        [config.method, f"setup {config.setup}", *world, f"seed {config.seed}", *changes]
-    )
-
-
 def scripted(config: RunConfig, names: Sequence[str]) -> Iterator[Panel]:
     """Yields a panel for each scripted policy, in the environment of a configuration."""
     for name in names:
@@ -77,8 +68,7 @@ def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, ScenarioConf
     usual, evaluated = shown_scenario(run), evaluation_scenarios(run)
     name, colon, index = (usual if text is None else str(text)).rpartition(":")
     if not colon:
-        is_number = index.lstrip("-").isdecimal()
-        name, index = (usual, index) if is_number else (index, "0")
+        name, index = (usual, index) if index.isdecimal() else (index, "0")
     known = dict.fromkeys([*scenarios(), *evaluated])
     if name not in known:
         raise UserError(f"fire {shown(name)!r} is not known; known: {', '.join(known)}")

@@ -48,13 +48,9 @@ the reset, or the "next" of the step), and the policy"""
 
 
 def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dict[str, Tensor]:
-    """Plays one episode in each environment with a policy that adds no noise.
+    """Plays one episode in each environment; returns the measures, float32 [num_envs] each.
 
-    Returns:
-        The measures of `metrics.names`, float32 [num_envs] each.
-
-    Raises:
-        UserError: an action is NaN or infinite.
+    The policy adds no noise. A UserError if an action is NaN or infinite.
     """
     world: Any = env.base_env
     steps: list[TensorDictBase] = []
@@ -97,15 +93,15 @@ def evaluation_scenarios(config: RunConfig) -> dict[str, ScenarioConfig]:
     return scenarios
 
 
-def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
-    """Returns the test fires of an evaluation: scenario -> times of `count` fires.
+def evaluation_fires(config: RunConfig, count: int, split: str = "test") -> dict[str, Tensor]:
+    """Returns the fires of an evaluation: scenario -> times of `count` fires.
 
     Times are steps, float32 [count, X, Y] or [count, 2, X, Y] (`split_times`). A scenario with a
     single fire repeats it; the start positions differ.
     """
     grid, horizon = config.env.grid, config.env.horizon
     return {
-        name: fires_of(scenario).fires("test", count, grid, horizon)
+        name: fires_of(scenario).fires(split, count, grid, horizon)
         for name, scenario in evaluation_scenarios(config).items()
     }
 
@@ -129,9 +125,6 @@ def evaluate(
         fires: number of test fires, one episode each.
         report: called with the names of the fire and the policy before each evaluation.
         watch: watches the first batch of the frozen policy on the fires of `shown_scenario`.
-
-    Returns:
-        fire -> policy -> measure -> one number per episode.
     """
     results: Results = {}
     for fire, arrival in evaluation_fires(config, fires).items():
@@ -152,21 +145,16 @@ def evaluate(
 
 
 def validate(config: RunConfig, actor: Policy) -> dict[str, float]:
-    """Evaluates a frozen policy on validation fires, for selecting the best checkpoint.
+    """Returns "fire/measure" -> mean of a frozen policy on validation fires.
 
     `evaluation.interval_episodes` episodes are played, on other fires and from other starts than
     in tests. A batch has one environment per episode, at most `BLOCK`.
-
-    Returns:
-        "fire/measure" -> mean.
     """
     count = config.evaluation.interval_episodes
+    protocol = {"start_seed": VALIDATION_START_SEED, "block": min(count, BLOCK)}
     result: dict[str, float] = {}
-    for name, scenario in evaluation_scenarios(config).items():
-        source, world = fires_of(scenario), config.env
-        arrival = source.fires("validation", count, world.grid, world.horizon)
-        seed, block = VALIDATION_START_SEED, min(count, BLOCK)
-        measured = play_learned(config, actor, arrival, start_seed=seed, block=block)
+    for name, arrival in evaluation_fires(config, count, "validation").items():
+        measured = play_learned(config, actor, arrival, **protocol)
         result |= {f"{name}/{measure}": value for measure, value in means(measured).items()}
     return result
 
@@ -267,19 +255,15 @@ def play_blocks(
     hold: int = 1,
     watch: Watch | None = None,
 ) -> Measured:
-    """Plays one episode on each fire, in batches.
+    """Plays one episode on each fire, in batches; returns the measures, one number per fire.
 
     Args:
-        config: configuration of the environment.
         policy: returns the policy for an environment.
         arrival: times of the fires in steps, float32 [fires, X, Y] or [fires, 2, X, Y].
         start_seed: seed of episode 0; episode i has this seed plus i.
         block: environments per batch. The last batch is padded with episodes that are not counted.
         hold: steps for which the environment holds each action.
         watch: watches the first batch.
-
-    Returns:
-        The measures of `metrics.names`, one number per fire.
     """
     count = len(arrival)
     measured: Measured = {name: [] for name in metrics.names(config.env)}

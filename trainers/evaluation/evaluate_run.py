@@ -14,7 +14,6 @@ from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError, naming
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate, figures
-from emberlink.trainers.evaluation.episodes import title_of
 from emberlink.trainers.evaluation.foreign import FOREIGN, foreign_name, is_reference, new_run
 from emberlink.trainers.evaluation.policy import TrainedPolicy, adopted, load_policy
 from emberlink.trainers.evaluation.scores import LEARNED, Results, print_results, reporter
@@ -38,12 +37,11 @@ def run_command(options: argparse.Namespace, console: Console) -> int:
         folder, device = read_run(options.folder), options.device
         policy = load_policy(folder, changes, checkpoint=file, device=device)
         run = open_run(options.folder)  # copies a trained policy of the package once all is checked
-    about = [file.stem] if file else []
-    parts = [*about, *(re.sub(r"[^\w.=+-]", "-", text) for text in changes)]
+    parts = [file.stem] if file else []
+    parts += [re.sub(r"[^\w.=+-]", "-", text) for text in changes]
     label = "".join(f"_{part}" for part in parts)
     if len(label) > _MAX_LABEL:
         label = f"{label[: _MAX_LABEL - 9]}_{hashlib.sha256(label.encode()).hexdigest()[:8]}"
-    policy.changes += tuple(about)
     results = evaluate_run(run, policy, options.fires, report=reporter(console), label=label)
     print_results(console, results, policy.config, foreign_name(run))
     console.print(str(run.path), soft_wrap=True)
@@ -91,7 +89,7 @@ def evaluate_run(
             raise
         results, failed = play(None), str(error)
     else:
-        shown = Episode(title=title_of(config, *policy.changes), recording=recorder.recording())
+        shown = Episode(title=policy.title, recording=recorder.recording())
         _draw(run, config, shown, label)
     scenarios = evaluate.evaluation_scenarios(config)
     policies = next(iter(results.values()))

@@ -98,13 +98,12 @@ class ForeignPolicy(TensorDictModuleBase):
             return self.policy(tensordict)[keys.ACTION]
         if began.all():
             self.state = None
-        if isinstance(self.policy, OnnxPolicy):
-            action, self.state = self.policy(tensordict, self.state)
-            return action
-        parts = {key[-1]: tensordict.get(key) for key in self.observed}
+        parts: Any = {key[-1]: tensordict.get(key) for key in self.observed}
         if not isinstance(self.policy, nn.Module):
             parts = {name: part.cpu().numpy() for name, part in parts.items()}
         observation = parts if len(parts) > 1 else next(iter(parts.values()))
+        if isinstance(self.policy, OnnxPolicy):
+            observation = tensordict
         if self._stateful:
             action, self.state = self.policy(observation, self.state)
         else:
@@ -199,10 +198,8 @@ def is_reference(text: str) -> bool:
 def open_policy(text: str) -> tuple[Any, str]:
     """Returns the policy of `module:name`, `file.py:name` or `file.onnx`; see `policy.opened`.
 
-    The second result is FILE:NAME or FILE.onnx with the whole path, by which it is opened again.
-
-    Raises:
-        UserError: there is no such file, module or name, or importing it fails.
+    The second result is FILE:NAME or FILE.onnx with the whole path, by which it is opened again. A
+    UserError if there is no such file, module or name, or importing it fails.
     """
     if text.endswith(".onnx"):
         if not (file := Path(text)).is_file():

@@ -20,7 +20,7 @@ from emberlink.trainers.build import build_actor, empty_env
 from emberlink.trainers.config.compose import differences, evaluated_with, resolve, to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import flat, parse
-from emberlink.trainers.evaluation.episodes import Panel, play_side_by_side, scripted, title_of
+from emberlink.trainers.evaluation.episodes import Panel, play_side_by_side, scripted
 from emberlink.trainers.evaluation.foreign import (
     FOREIGN,
     ForeignPolicy,
@@ -53,7 +53,8 @@ class TrainedPolicy(TensorDictSequential):
         actor: the networks.
         config: configuration of the run.
         checkpoint: file of the networks, or `foreign.FOREIGN`.
-        changes: settings that differ from the training's, such as `env.radio.range=0`.
+        changes: settings that differ from the training's, such as `env.radio.range=0`, and the name
+            of a chosen checkpoint.
     """
 
     def __init__(
@@ -132,9 +133,18 @@ class TrainedPolicy(TensorDictSequential):
         name, played = play_side_by_side(panels, fire)
         return Replay(played, name)
 
-    def panel(self, *about: str) -> Panel:
-        """Returns the policy and its title, which names changed settings and more texts."""
-        return Panel(title_of(self.config, *self.changes, *about), self.config, lambda _: self)
+    def panel(self) -> Panel:
+        """Returns the policy and its title."""
+        return Panel(self.title, self.config, lambda _: self)
+
+    @property
+    def title(self) -> str:
+        """The run and what was changed; the world is named anyway."""
+        config = self.config
+        world = [] if config.world == "paper" else [f"world {config.world}"]
+        changes = [text for text in self.changes if not text.startswith("world=")]
+        parts = [config.method, f"setup {config.setup}", *world, f"seed {config.seed}", *changes]
+        return ", ".join(parts)
 
 
 def load_policy(
@@ -166,6 +176,7 @@ def load_policy(
             f"{', '.join(fixed)}: an evaluation changes only keys of {', '.join(_CHANGEABLE)}"
         )
     changes = [*overrides, *(f"{key}={shown(value)}" for key, value in (settings or {}).items())]
+    changes += [] if checkpoint is None else [checkpoint.stem]
     if file is None:
         place = reference_of(run)
         return foreign_policy(opened(place)[0], place, name, config, changes)

@@ -69,8 +69,7 @@ def learned(arguments: Sequence[str], checkpoints: Sequence[Path] = ()) -> Itera
     titles: set[str] = set()
     for (name, changes), file in zip(runs, checkpoints or [None] * len(runs), strict=True):
         run = read_run(name)
-        policy = load_policy(run, changes, checkpoint=file, device="cpu")
-        panel = policy.panel(*([file.stem] if file else []))
+        panel = load_policy(run, changes, checkpoint=file, device="cpu").panel()
         if panel.title in titles:  # runs that were trained with other settings
             panel = replace(panel, title=f"{panel.title}, {run.path.name}")
         titles.add(panel.title)

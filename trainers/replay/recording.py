@@ -103,13 +103,6 @@ class Recording:
         seen, burnt = (int(self.steps[name][step]) for name in ("seen", "burnt"))
         return 100 * seen / burnt if burnt else 100.0
 
-    def roles(self, step: int) -> list[int | None]:
-        """Returns the role of each UAV at a step, an index in `ROLES`; None without roles."""
-        if "follows" not in self.steps:
-            return [None] * self.world.num_uavs
-        followed = enumerate(self.steps["follows"][step].tolist())
-        return [2 if other < 0 else int(other != uav) for uav, other in followed]
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Episode:

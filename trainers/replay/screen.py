@@ -119,7 +119,10 @@ def draw_step(axes: Axes, episode: Recording, step: int, *, seen_fire: str = fra
         # The dark edges of many links would hide the map.
         for colour, width in {frame.NO_FIRE: 3.0, LINK: 1.5}.items() if few else ((LINK, 0.75),):
             _lines(axes, links, colors=colour, linewidths=width)
-    roles = np.array(episode.roles(step))
+    roles = np.full(len(places), None)
+    if "follows" in now:
+        follows_other = now["follows"] != np.arange(len(places))
+        roles = np.where(now["follows"] < 0, 2, follows_other)
     for role in dict.fromkeys(roles[alive]):
         of_role = alive & (roles == role)
         style = {"color": NO_ROLE} if role is None else ROLE_MARKS[role]

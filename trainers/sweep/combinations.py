@@ -41,7 +41,7 @@ class Combination:
     def finished(self) -> bool:
         """Whether the run has all episodes and an evaluation of its newest checkpoint."""
         enough = self.episodes >= self.config.episodes
-        return enough and self.folder is not None and self.folder.evaluated()
+        return self.folder is not None and enough and self.folder.evaluated()
 
     @property
     def state(self) -> str:

@@ -20,9 +20,6 @@ from emberlink.trainers.terminal.signals import Interruption
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Progress, Trainer
 
-_RUN = "run"
-"""attribute of a trial: its run folder, in which an interrupted trial continues"""
-
 
 def tune(
     method: str, overrides: Sequence[str], console: Console, *, space: Path | None, trials: int
@@ -120,9 +117,9 @@ def _distribution(key: str, values: Any) -> Any:
 
 
 def _trainer(trial: Any, method: str, overrides: Sequence[str]) -> Trainer:
-    """Returns the training of a trial, new or resumed after an interruption."""
-    if run := trial.user_attrs.get(_RUN):
+    """Returns the training of a trial, new or resumed in the run folder that the trial names."""
+    if run := trial.user_attrs.get("run"):
         return resume(run)
     trainer = Trainer(resolve(method, overrides))
-    trial.set_user_attr(_RUN, str(trainer.start().path))
+    trial.set_user_attr("run", str(trainer.start().path))
     return trainer
