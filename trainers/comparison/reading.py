@@ -3,6 +3,7 @@
 A configuration is read as plain values, so that runs of earlier versions stay readable.
 """
 
+import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -10,11 +11,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass as checked
 
-from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import describe, shown
+from emberlink.envs.utils.errors import UserError, naming
+from emberlink.envs.utils.validation import from_plain, shown
 from emberlink.trainers.config.values import flat
 from emberlink.trainers.evaluation.foreign import foreign_name
 from emberlink.trainers.evaluation.scores import LEARNED
@@ -166,11 +167,8 @@ def _check_types(settings: Mapping[str, Any], file: Path) -> None:
 
 def read_evaluation(file: Path) -> Evaluation:
     """Returns the content of an eval.json."""
-    text = read_text(file, MAX_JSON)
-    try:
-        evaluation = TypeAdapter(Evaluation).validate_json(text)
-    except ValidationError as error:
-        raise UserError(f"{file}: {' '.join(describe(error).split())[:300]}") from None
+    with naming(file):
+        evaluation = from_plain(Evaluation, json.loads(read_text(file, MAX_JSON)))
     for fire, policies in evaluation.results.items():
         if LEARNED not in policies:
             why = evaluation.failed or f"results.{fire} has no policy {LEARNED!r}"

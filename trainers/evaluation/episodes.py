@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from emberlink.envs.fire.generator import load_scenario, scenarios
-from emberlink.envs.scenarios import ScenarioConfig, fires_of
+from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import is_index, shown
 from emberlink.envs.wildfire import WildfireEnv
@@ -57,8 +57,8 @@ def scripted(config: RunConfig, names: Sequence[str]) -> Iterator[Panel]:
         yield Panel(title, scripted_config(config, name), SCRIPTED.find(name))
 
 
-def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, ScenarioConfig, int]:
-    """Returns the name, the scenario and the index of a held-out fire.
+def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, int, Tensor]:
+    """Returns the name, the index and the times, [1, X, Y], of a held-out fire.
 
     Args:
         text: NAME, INDEX or NAME:INDEX. The defaults are the name of `shown_scenario` and
@@ -74,18 +74,17 @@ def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, ScenarioConf
         raise UserError(f"fire {shown(name)!r} is not known; known: {', '.join(known)}")
     if not is_index(index, MAX_FIRES):
         raise UserError(f"fire {shown(index)!r}: no held-out fire; known: 0 to {MAX_FIRES - 1}")
-    return name, evaluated.get(name) or load_scenario(name), int(index)
+    source = fires_of(evaluated.get(name) or load_scenario(name))
+    return name, int(index), source.test_fire(int(index), run.env.grid, run.env.horizon)
 
 
 def play_side_by_side(
     panels: Sequence[Panel],
-    fire: str | int | None,
+    arrival: Tensor,
+    index: int,
     report: Callable[[str], None] = lambda _: None,
-) -> tuple[str, list[Episode]]:
-    """Plays the same episode of each panel and returns the name of the fire and the episodes.
-
-    `report` is called with a line of text after each; for `fire` see `find_fire`.
-    """
+) -> list[Episode]:
+    """Plays the same episode of each panel; `report` is called with a line of text after each."""
     world = panels[0].config.env
     for panel, name in product(panels, SHARED):
         expected, actual = getattr(world, name), getattr(panel.config.env, name)
@@ -94,12 +93,10 @@ def play_side_by_side(
                 f"{panel.title} has env.{name}={actual}, {panels[0].title} has {expected}: "
                 f"side by side, {', '.join(SHARED)} must be the same"
             )
-    name, scenario, index = find_fire(fire, panels[0].config)
-    arrival = fires_of(scenario).test_fire(index, world.grid, world.horizon)
     episodes = []
     for panel in panels:
         episode = panel.play(arrival, index)
         covered = episode.recording.coverage(episode.recording.horizon)
         report(f"  {panel.title}: coverage {covered:.1f} %")
         episodes.append(episode)
-    return f"{name}:{index}", episodes
+    return episodes

@@ -20,7 +20,7 @@ from emberlink.trainers.build import build_actor, empty_env
 from emberlink.trainers.config.compose import differences, evaluated_with, resolve, to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import flat, parse
-from emberlink.trainers.evaluation.episodes import Panel, play_side_by_side, scripted
+from emberlink.trainers.evaluation.episodes import Panel, find_fire, play_side_by_side, scripted
 from emberlink.trainers.evaluation.foreign import (
     FOREIGN,
     ForeignPolicy,
@@ -130,8 +130,8 @@ class TrainedPolicy(TensorDictSequential):
         """
         panels = [policy.panel() for policy in (self, *others)]
         panels += scripted(self.config, policies)
-        name, played = play_side_by_side(panels, fire)
-        return Replay(played, name)
+        name, index, arrival = find_fire(fire, self.config)
+        return Replay(play_side_by_side(panels, arrival, index), f"{name}:{index}")
 
     def panel(self) -> Panel:
         """Returns the policy and its title."""

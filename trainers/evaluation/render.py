@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from PIL import Image
@@ -27,26 +28,25 @@ def render(options: argparse.Namespace, console: Console) -> int:
     """Plays an episode of each run on the same fire, writes the files and returns 0."""
     panels = [*learned(options.runs, options.checkpoint)]
     panels += episodes.scripted(panels[0].config, options.policy)
-    fire, _, index = episodes.find_fire(options.fire, panels[0].config)
+    fire, index, arrival = episodes.find_fire(options.fire, panels[0].config)
     shown = "episode" if len(panels) == 1 else "side_by_side"
     stem = "_".join([shown, fire, str(index), *(path.stem for path in options.checkpoint)])
     paths = _free_paths(options.output, options.runs[0], stem)
     steps = _steps(options, panels[0].config.env.horizon, paths[0])
-    name, played = episodes.play_side_by_side(
-        panels, f"{fire}:{index}", lambda text: console.print(text, style="dim", highlight=False)
-    )
+    report = partial(console.print, style="dim", highlight=False)
+    played = episodes.play_side_by_side(panels, arrival, index, report)
     least, most = _ALONE if len(panels) == 1 else _BESIDE
     size = options.size or min(max(_CELL * max(panels[0].config.env.grid), least), most)
     screen = Screen(played, size=size, grey_seen=options.seen)
     for path in paths:
-        with created(path) as partial:
+        with created(path) as new:
             if path.suffix == ".html":
-                Replay(played, name).save(partial)
+                Replay(played, f"{fire}:{index}").save(new)
             elif path.suffix == ".png":
-                Image.fromarray(screen.picture(steps[0])).save(partial, "PNG", optimize=True)
+                Image.fromarray(screen.picture(steps[0])).save(new, "PNG", optimize=True)
             else:
                 write = write_gif if path.suffix == ".gif" else write_mp4
-                write(partial, map(screen.picture, steps), fps=options.fps)
+                write(new, map(screen.picture, steps), fps=options.fps)
         console.print(str(path), soft_wrap=True, highlight=False)
     return 0
 

@@ -76,8 +76,9 @@ def test_episodes_side_by_side_have_the_same_fire_and_starts(tmp_path):
     panels = [*render.learned(runs)]
     policies = ("follow_target", "map_greedy", "map_greedy_alone")
     panels += episodes.scripted(panels[0].config, policies)
-    name, shown = episodes.play_side_by_side(panels, "paper:3")
-    assert name == "paper:3"
+    name, index, arrival = episodes.find_fire("paper:3", panels[0].config)
+    assert (name, index) == ("paper", 3)
+    shown = episodes.play_side_by_side(panels, arrival, index)
     first, *others = (episode.recording for episode in shown)
     for other in others:
         assert np.array_equal(other.steps["position"][0], first.steps["position"][0])

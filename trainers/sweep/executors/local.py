@@ -37,15 +37,11 @@ class LocalExecutor(Executor):
     def submit(self, tasks: Sequence[Task]) -> Sequence[subprocess.Popen]:
         # The first tasks are all, or as many as run at a time.
         self._threads = self._threads or max(self._cores // len(tasks), 1)
-        return [self._start(task, self._threads) for task in tasks]
-
-    def _start(self, task: Task, threads: int) -> subprocess.Popen:
-        """Starts a task on the GPU with the fewest tasks, if the GPUs are shared."""
-        busy = [gpu for process, gpu in self._started if process.poll() is None]
-        gpu = min(range(self._config.gpus or 0), key=busy.count, default=None)
-        process = task.start(threads, gpu)
-        self._started.append((process, gpu))
-        return process
+        for task in tasks:  # each on the GPU with the fewest tasks, if the GPUs are shared
+            busy = [gpu for process, gpu in self._started if process.poll() is None]
+            gpu = min(range(self._config.gpus or 0), key=busy.count, default=None)
+            self._started.append((task.start(self._threads, gpu), gpu))
+        return [process for process, _ in self._started[-len(tasks) :]]
 
     def poll(self, handle: subprocess.Popen) -> int | None:
         return handle.poll()
