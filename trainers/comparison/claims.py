@@ -21,8 +21,6 @@ COLUMNS = (
 )
 """columns of `verdicts`: `ratio` of the interquartile means, above 1 if the method is better;
 infinite for a ratio to 0"""
-
-
 METHOD = "consensus"
 CLAIMS = (
     ("coverage", 1.3, "1.3 times the coverage"),

@@ -35,6 +35,8 @@ interval of full - none is not above 0 (below, if less is better)."""
 
 Group = list[Run]
 """the runs of a label"""
+Found = Iterator[tuple[str, str, str, list[Values]]]
+"""label, measure, `radios`, and [seeds, fires] with the radio off, on and maybe without limits"""
 
 
 def communication_values(runs: Frame) -> Frame:
@@ -53,10 +55,6 @@ def communication_values(runs: Frame) -> Frame:
         for label, measure, how, samples in found
     ]
     return pd.DataFrame(rows, columns=list(COLUMNS))
-
-
-Found = Iterator[tuple[str, str, str, list[Values]]]
-"""label, measure, `radios`, and [seeds, fires] with the radio off, on and maybe without limits"""
 
 
 def _of_networks(groups: Mapping[str, Group], fires: str) -> Found:

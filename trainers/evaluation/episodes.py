@@ -23,7 +23,7 @@ from emberlink.trainers.evaluation.evaluate import (
     scripted_config,
     shown_scenario,
 )
-from emberlink.trainers.replay.recording import Episode, Recorder
+from emberlink.trainers.replay.recording import Recorder, Recording
 
 SHARED = ("grid", "num_uavs", "horizon", "altitude")
 """keys of `env` on which fires and start positions depend"""
@@ -38,7 +38,7 @@ class Panel:
     policy: Callable[[WildfireEnv], TensorDictModuleBase]
     """returns the policy for an environment"""
 
-    def play(self, arrival: Tensor, index: int) -> Episode:
+    def play(self, arrival: Tensor, index: int) -> Recording:
         """Plays and records episode `index` of the evaluation on a fire, [1, X, Y].
 
         It has the same place in its batch as in an evaluation, so that the numbers are the same to
@@ -47,7 +47,7 @@ class Panel:
         recorder = Recorder(index % BLOCK)
         seed = START_SEED + index - recorder.member
         play_blocks(self.config, self.policy, arrival, start_seed=seed, watch=recorder.add)
-        return Episode(title=self.title, recording=recorder.recording())
+        return recorder.recording(self.title)
 
 
 def scripted(config: RunConfig, names: Sequence[str]) -> Iterator[Panel]:
@@ -83,7 +83,7 @@ def play_side_by_side(
     arrival: Tensor,
     index: int,
     report: Callable[[str], None] = lambda _: None,
-) -> list[Episode]:
+) -> list[Recording]:
     """Plays the same episode of each panel; `report` is called with a line of text after each."""
     world = panels[0].config.env
     for panel, name in product(panels, SHARED):
@@ -96,7 +96,6 @@ def play_side_by_side(
     episodes = []
     for panel in panels:
         episode = panel.play(arrival, index)
-        covered = episode.recording.coverage(episode.recording.horizon)
-        report(f"  {panel.title}: coverage {covered:.1f} %")
+        report(f"  {panel.title}: coverage {episode.coverage(episode.horizon):.1f} %")
         episodes.append(episode)
     return episodes

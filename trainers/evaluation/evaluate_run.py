@@ -18,7 +18,7 @@ from emberlink.trainers.evaluation.foreign import FOREIGN, foreign_name, is_refe
 from emberlink.trainers.evaluation.policy import TrainedPolicy, adopted, load_policy
 from emberlink.trainers.evaluation.scores import LEARNED, Results, print_results, reporter
 from emberlink.trainers.replay.page import Replay
-from emberlink.trainers.replay.recording import Episode, Recorder
+from emberlink.trainers.replay.recording import Recorder, Recording
 from emberlink.trainers.replay.screen import Screen, even_steps
 from emberlink.trainers.runs.checkpoint import read_header, versions
 from emberlink.trainers.runs.pretrained import open_run, read_run
@@ -89,8 +89,7 @@ def evaluate_run(
             raise
         results, failed = play(None), str(error)
     else:
-        shown = Episode(title=policy.title, recording=recorder.recording())
-        _draw(run, config, shown, label)
+        _draw(run, config, recorder.recording(policy.title), label)
     scenarios = evaluate.evaluation_scenarios(config)
     policies = next(iter(results.values()))
     content = {
@@ -120,7 +119,7 @@ def evaluate_run(
     return results
 
 
-def _draw(run: RunFolder, config: RunConfig, episode: Episode, label: str) -> None:
+def _draw(run: RunFolder, config: RunConfig, episode: Recording, label: str) -> None:
     if lines := run.metrics():
         title = f"{config.method}, setup {config.setup}, fire {config.fire.name}"
         with run.figure("training.png") as path:
@@ -130,6 +129,6 @@ def _draw(run: RunFolder, config: RunConfig, episode: Episode, label: str) -> No
         screen = Screen([episode], size=480)
         write_gif(path, map(screen.picture, even_steps(config.env.horizon, 100)))
     with run.figure(f"timelapse_{name}{label}.png") as path:
-        figures.timelapse(path, episode.recording)
+        figures.timelapse(path, episode)
     with run.figure(f"replay{label}.html") as path:
         Replay([episode], f"{name}:0").save(path)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.world.sensor import Sensor
-from emberlink.trainers.replay.recording import ROLES, Episode
+from emberlink.trainers.replay.recording import ROLES, Recording
 
 SCRIPTS = ("unpack.js", "knowledge.js", "palette.js", "map.js", "curves.js", "replay.js")
 """modules of the page, each after the modules that it imports"""
@@ -30,7 +30,7 @@ _HUNDREDTHS = 100  # units of a stored position per cell
 class Replay:
     """A page that plays episodes on the fire `fire` side by side; Jupyter shows it inline."""
 
-    def __init__(self, shown: Sequence[Episode], fire: str):
+    def __init__(self, shown: Sequence[Recording], fire: str):
         environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
         self.html = environment.from_string(_read("web", "page.html")).render(
             fire=fire,
@@ -67,9 +67,9 @@ def _read(*names: str) -> str:
     return files("emberlink.trainers.replay").joinpath(*names).read_text("utf-8")
 
 
-def encode(shown: Sequence[Episode], fire: str) -> bytes:
+def encode(shown: Sequence[Recording], fire: str) -> bytes:
     """Returns the data of a page, JSON that is compressed with gzip, which web/unpack.js reads."""
-    first = shown[0].recording
+    first = shown[0]
     data = {
         "fire": fire,
         "grid": list(first.world.grid),
@@ -84,9 +84,9 @@ def encode(shown: Sequence[Episode], fire: str) -> bytes:
     return gzip.compress(text.encode(), 9, mtime=0)
 
 
-def _panel(shown: Episode) -> dict[str, Any]:
+def _panel(shown: Recording) -> dict[str, Any]:
     """Returns the data of an episode; `steps` has a row for each number, with all its steps."""
-    world, steps = shown.recording.world, shown.recording.steps | shown.recording.ages()
+    world, steps = shown.world, shown.steps | shown.ages()
     fails = [int(step) for step in steps.pop("alive").sum(0)]
     if not steps["lost"].any():
         del steps["lost"]

@@ -32,6 +32,8 @@ ROLES = ("discoverer", "seeker", "wanderer")
 class Recording:
     """One episode: T steps, n UAVs, r radios (the UAVs, and the base last if there is one)."""
 
+    title: str = ""
+    """the title that it is shown with"""
     world: WildfireConfig
     listens: bool
     """whether the policy or a base station receives messages"""
@@ -104,14 +106,6 @@ class Recording:
         return 100 * seen / burnt if burnt else 100.0
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Episode:
-    """An episode and the title that it is shown with."""
-
-    title: str
-    recording: Recording
-
-
 class Recorder:
     """Records the episode of the environment with index `member`; `add` is called at each step.
 
@@ -142,13 +136,14 @@ class Recorder:
             if value is not None:
                 self._steps.setdefault(name, []).append(value[0].numpy().copy())
 
-    def recording(self) -> Recording:
+    def recording(self, title: str = "") -> Recording:
         """Returns the recorded episode."""
         steps = {name: np.stack(values) for name, values in self._steps.items()}
         listens = self._hears or self._config.base is not None
         ignition, end = (times.numpy() for times in self._whole)
+        world = self._config
         return Recording(
-            world=self._config, listens=listens, ignition=ignition, end=end, steps=steps
+            title=title, world=world, listens=listens, ignition=ignition, end=end, steps=steps
         )
 
     def _start(self, env: TransformedEnv, policy: Any) -> None:

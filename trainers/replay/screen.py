@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from emberlink.envs.rendering import frame
 from emberlink.envs.rendering.frame import DPI, mark
-from emberlink.trainers.replay.recording import ROLES, Episode, Recording
+from emberlink.trainers.replay.recording import ROLES, Recording
 
 SEEN_FIRE = "#8c8c8c"
 """colour of seen fire where seen and unseen fire differ (paper, figure 2)"""
@@ -42,9 +42,9 @@ class Screen:
     A map's longer side has about `size` pixels; seen fire is grey if `grey_seen`.
     """
 
-    def __init__(self, episodes: Sequence[Episode], *, size: int, grey_seen: bool = False):
+    def __init__(self, episodes: Sequence[Recording], *, size: int, grey_seen: bool = False):
         self._episodes, self._grey_seen = episodes, grey_seen
-        grid, count = episodes[0].recording.world.grid, len(episodes)
+        grid, count = episodes[0].world.grid, len(episodes)
         width, height = (size * side / max(grid) for side in grid)
         width = max(width, _NARROWEST)
         columns = min(count, math.ceil(math.sqrt(count * height / width)))
@@ -78,15 +78,15 @@ class Screen:
             for earlier in (*axes.images, *axes.collections, *axes.lines):
                 earlier.remove()
             axes.set_visible(True)
-            draw_step(axes, episode.recording, step, seen_fire=seen)
-            text = title.format(step, episode.recording.coverage(step))
+            draw_step(axes, episode, step, seen_fire=seen)
+            text = title.format(step, episode.coverage(step))
             axes.set_title(text, loc="left", color=_INK, fontsize=10, parse_math=False)
             axes.draw_artist(axes)
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
     def legend(self) -> list[Line2D]:
         """Returns a sample with a label for each mark that occurs."""
-        shown = [episode.recording for episode in self._episodes]
+        shown = self._episodes
         last = [one.fire_map(one.horizon) for one in shown]
         roles = ["follows" in one.steps for one in shown]
         target = ROLE_MARKS[0]["color"] if any(roles) else NO_ROLE

@@ -79,7 +79,7 @@ def test_episodes_side_by_side_have_the_same_fire_and_starts(tmp_path):
     name, index, arrival = episodes.find_fire("paper:3", panels[0].config)
     assert (name, index) == ("paper", 3)
     shown = episodes.play_side_by_side(panels, arrival, index)
-    first, *others = (episode.recording for episode in shown)
+    first, *others = shown
     for other in others:
         assert np.array_equal(other.steps["position"][0], first.steps["position"][0])
         assert np.array_equal(other.ignition, first.ignition)
@@ -87,13 +87,14 @@ def test_episodes_side_by_side_have_the_same_fire_and_starts(tmp_path):
     assert len(ends) > len(methods)
     for method, episode in zip(methods, shown, strict=False):
         assert episode.title == f"{method}, setup tuned, seed 0"
-        record = episode.recording
-        assert record.listens == (method in ("consensus", "maps", "positional"))
-        assert ("follows" in record.steps) == ("target" in record.steps) == (method == "consensus")
+        assert episode.listens == (method in ("consensus", "maps", "positional"))
+        assert (
+            ("follows" in episode.steps) == ("target" in episode.steps) == (method == "consensus")
+        )
     for name, episode in zip(policies, shown[len(methods) :], strict=True):
         follows = SCRIPTED.find(name).recipe is not None
-        assert ("follows" in episode.recording.steps) == follows
-        assert episode.recording.listens == (follows or SCRIPTED.find(name).hears)
+        assert ("follows" in episode.steps) == follows
+        assert episode.listens == (follows or SCRIPTED.find(name).hears)
 
 
 def test_a_picture_of_another_grid(tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -16,7 +17,6 @@ from emberlink.envs import keys
 from emberlink.trainers import load
 from emberlink.trainers.cli import main
 from emberlink.trainers.replay.page import Replay
-from emberlink.trainers.replay.recording import Episode
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>{{ 7*7 }}\"'&amp;"
 
@@ -28,7 +28,7 @@ def episode():
 
 @pytest.fixture(scope="module")
 def data(episode):
-    return data_of(Replay([Episode(title="one", recording=episode.recording)], "small:0").html)
+    return data_of(Replay([replace(episode.recording, title="one")], "small:0").html)
 
 
 def test_numbers_of_every_step_are_those_of_the_environment(episode, data):
@@ -59,7 +59,7 @@ def test_a_limited_radio_records_what_waits_and_the_links_of_those_that_speak(da
     (plain,) = data["panels"]
     limits = "env.radio.bandwidth=12", "env.radio.delay=2", "env.radio.loss=0"
     limited = play_small(*limits)
-    (panel,) = data_of(Replay([Episode(title="", recording=limited.recording)], "").html)["panels"]
+    (panel,) = data_of(Replay([limited.recording], "").html)["panels"]
     assert not {"delay", "waits"} & {*plain}
     assert panel["delay"] == 2
     assert [[*row] for row in zip(*panel["waits"], strict=True)] == limited.waits
@@ -114,11 +114,11 @@ def test_fire_is_that_of_the_environment(episode, data):
 
 
 def test_a_hostile_name_is_text(episode):
-    page = Replay([Episode(title=HOSTILE, recording=episode.recording)], HOSTILE).html
-    plain = Replay([Episode(title="one", recording=episode.recording)], "x:0").html
+    page = Replay([replace(episode.recording, title=HOSTILE)], HOSTILE).html
+    plain = Replay([replace(episode.recording, title="one")], "x:0").html
     assert data_of(page)["panels"][0]["title"] == HOSTILE
     assert _tags(page) == _tags(plain)
-    frame = Replay([Episode(title=HOSTILE, recording=episode.recording)], HOSTILE)._repr_html_()
+    frame = Replay([replace(episode.recording, title=HOSTILE)], HOSTILE)._repr_html_()
     assert [tag for tag, _ in _tags(frame)] == ["iframe"]
 
 

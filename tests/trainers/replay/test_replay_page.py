@@ -1,6 +1,7 @@
 """Tests the page that plays episodes in a browser, on a desktop and on a phone."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from small_episode import SIDES, STEPS, play_small
 from emberlink.envs import WildfireConfig, keys
 from emberlink.envs.config import RadioConfig
 from emberlink.trainers.replay.page import Replay
-from emberlink.trainers.replay.recording import Episode, Recording
+from emberlink.trainers.replay.recording import Recording
 
 pytestmark = pytest.mark.slow
 
@@ -41,7 +42,7 @@ def episodes():
 @pytest.fixture(scope="module")
 def replay(episodes):
     shown = [
-        Episode(title=title, recording=episode.recording)
+        replace(episode.recording, title=title)
         for title, episode in zip(("with messages", HOSTILE), episodes, strict=True)
     ]
     return Replay(shown, HOSTILE)
@@ -83,7 +84,7 @@ def test_a_late_message_holds_what_was_known_when_it_was_sent(browser, tmp_path)
     )
     end = np.full_like(ignition, steps)
     made = Recording(world=world, listens=True, ignition=ignition, end=end, steps=values)
-    Replay([Episode(title="late", recording=made)], "").save(tmp_path / "page.html")
+    Replay([replace(made, title="late")], "").save(tmp_path / "page.html")
     tab = Tab(browser, f"file://{tmp_path / 'page.html'}")
     tab.page.wait_for_selector("#curves .uplot")
     assert "at most" in tab.page.inner_text("#layers")

@@ -7,7 +7,7 @@ from PIL.ImageColor import getrgb
 from emberlink.envs import WildfireConfig
 from emberlink.envs.rendering import frame
 from emberlink.trainers.replay import screen
-from emberlink.trainers.replay.recording import Episode, Recording
+from emberlink.trainers.replay.recording import Recording
 
 WHERE = [(2, 2, 1), (12, 2, 1), (22, 12, 1)]
 FOLLOWS = np.array([0, 0, -1])
@@ -46,7 +46,7 @@ def recorded(
 
 def around(episode: Recording, place, reach: int = 2, **options) -> set[tuple[int, ...]]:
     """Returns the colours of the last step near a position in cells."""
-    made = screen.Screen([Episode(title="one", recording=episode)], size=360, **options)
+    made = screen.Screen([episode], size=360, **options)
     image = made.picture(1)
     across, up = made.axes[0].transData.transform(place).round().astype(int)
     near = image[::-1][up - reach : up + reach + 1, across - reach : across + reach + 1]
