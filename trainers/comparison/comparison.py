@@ -146,12 +146,7 @@ def about() -> dict[str, Any]:
 
 
 def compare_runs(paths: Sequence[Path], labels: Sequence[str] = ()) -> Comparison:
-    """Compares runs by setup, world, training fire and label.
-
-    Args:
-        paths: run folders, folders of run folders, or names such as `pretrained:tuned`.
-        labels: a name for the runs of each path, instead of their method.
-    """
+    """Compares runs; arguments as for `emberlink.trainers.compare`."""
     if not paths:
         raise UserError("nothing to compare: expected at least one run folder")
     read, left_out = read_all(paths, labels)

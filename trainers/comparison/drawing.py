@@ -36,8 +36,6 @@ FROZEN = ("coverage", "tracking_first", "tracking_last", "boundary_exits")
 """measures of the figure of frozen policies, besides the world's headline"""
 LOGARITHMIC = {"tracking_first": 1.0, "boundary_exits": 0.1}
 """measure with a logarithmic axis in that figure -> value below which the axis is linear"""
-DOTTED = "tracking_last"
-"""measure with dotted lines, as in the paper's figure 7"""
 FROZEN_CAPTION = (
     "frozen policies. Small dots: each seed's mean over the fires. Large dot: interquartile mean "
     "over seeds; line: 95 % bootstrap interval, none with one seed. Dashed: scripted policies. The "
@@ -68,7 +66,7 @@ def training(
         for row in scripted[scripted["measure"] == measure].to_dict("records"):
             axes.axhline(row["iqm"], **dashes[row["label"]])
         for label, curve in curves[curves["measure"] == measure].groupby("label"):
-            style = {"color": colours[label], "ls": ":" if measure == DOTTED else "-"}
+            style = {"color": colours[label], "ls": ":" if measure == "tracking_last" else "-"}
             style |= {"lw": 2, "marker": "o" if len(curve) == 1 else "", "label": _wrapped(label)}
             axes.plot(curve["episode"], curve["iqm"], **style)
             if curve["low"].notna().all():

@@ -71,10 +71,8 @@ def evaluate_run(
 ) -> Results:
     """Evaluates a frozen policy and writes eval.json, the figures, a GIF and a replay page.
 
-    Args:
-        fires: number of test fires, one episode each; `evaluation.episodes` if None.
-        report: see `evaluate.evaluate`.
-        label: suffix of the file names.
+    Arguments as for `evaluate.evaluate`; `fires` is `evaluation.episodes` if None, `label` the
+    suffix of the file names.
     """
     with naming(run.path / "figures"):
         run.figures()  # an unusable folder is an error before the episodes, not after

@@ -87,8 +87,7 @@ def export(run: str | PathLike[str], file: str | Path) -> tuple[Path, Path]:
 
 
 def _dynamic(tensor: Tensor, grows: int | None) -> dict[int, Any]:
-    """Returns the dimensions that an ONNX file leaves open: environments, and UAVs if it `grows`
-    from a team of so many."""
+    """Returns the open dimensions: environments, and UAVs if a team of `grows` UAVs may grow."""
     return {
         place: Dim.DYNAMIC
         for place, size in enumerate(tensor.shape[:3])

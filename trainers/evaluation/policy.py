@@ -50,8 +50,6 @@ class TrainedPolicy(TensorDictSequential):
     them.
 
     Args:
-        actor: the networks.
-        config: configuration of the run.
         checkpoint: file of the networks, or `foreign.FOREIGN`.
         changes: settings that differ from the training's, such as `env.radio.range=0`, and the name
             of a chosen checkpoint.
@@ -196,11 +194,8 @@ def adopted(
 ) -> tuple[TrainedPolicy, str]:
     """Returns a policy for the environment of a method, and by which text it is opened again.
 
-    A run, or an ONNX file of `emberlink export`, chooses setup, world and hold unless `overrides`
-    or `settings` do, see `resolve`.
-
-    Args:
-        policy: see `foreign.ForeignPolicy`; or a text, or a run's folder, see `opened`.
+    `policy` is one of `foreign.ForeignPolicy`, or a text, see `opened`. A run, or an ONNX file of
+    `emberlink export`, chooses setup, world and hold unless `overrides` or `settings` do.
     """
     place, reference = name or "policy", ""
     if isinstance(policy, str | PathLike):

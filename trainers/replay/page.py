@@ -24,7 +24,6 @@ SCRIPTS = ("unpack.js", "knowledge.js", "palette.js", "map.js", "curves.js", "re
 """modules of the page, each after the modules that it imports"""
 _IMPORT = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL)
 _EXPORT = re.compile(r"^export (?=const|function|class|async)", re.MULTILINE)
-_HUNDREDTHS = 100  # units of a stored position per cell
 
 
 class Replay:
@@ -107,7 +106,7 @@ def _panel(shown: Recording) -> dict[str, Any]:
 
 def _hundredths(cells: NDArray[np.float32]) -> NDArray[np.int64]:
     """Returns lengths in hundredths of a cell."""
-    return np.rint(np.nan_to_num(cells.astype(np.float64)) * _HUNDREDTHS).astype(np.int64)
+    return np.rint(np.nan_to_num(cells.astype(np.float64)) * 100).astype(np.int64)
 
 
 def _rows(values: NDArray[Any]) -> list[Any]:
