@@ -19,7 +19,7 @@ from torchrl.envs import TransformedEnv, step_mdp
 from emberlink.comm.base import MODULES, CommModule
 from emberlink.envs import keys, metrics
 from emberlink.envs.fire.cache import cache_folder
-from emberlink.envs.fire.generator import load_scenario
+from emberlink.envs.fire.generator import Split, load_scenario
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.scenarios import ScenarioConfig, fires_of, same_tests
 from emberlink.envs.utils.atomic_io import write_bytes
@@ -93,7 +93,7 @@ def evaluation_scenarios(config: RunConfig) -> dict[str, ScenarioConfig]:
     return scenarios
 
 
-def evaluation_fires(config: RunConfig, count: int, split: str = "test") -> dict[str, Tensor]:
+def evaluation_fires(config: RunConfig, count: int, split: Split = "test") -> dict[str, Tensor]:
     """Returns the fires of an evaluation: scenario -> times of `count` fires.
 
     Times are steps, float32 [count, X, Y] or [count, 2, X, Y] (`split_times`). A scenario with a
@@ -151,10 +151,10 @@ def validate(config: RunConfig, actor: Policy) -> dict[str, float]:
     in tests. A batch has one environment per episode, at most `BLOCK`.
     """
     count = config.evaluation.interval_episodes
-    protocol = {"start_seed": VALIDATION_START_SEED, "block": min(count, BLOCK)}
+    seed, block = VALIDATION_START_SEED, min(count, BLOCK)
     result: dict[str, float] = {}
     for name, arrival in evaluation_fires(config, count, "validation").items():
-        measured = play_learned(config, actor, arrival, **protocol)
+        measured = play_learned(config, actor, arrival, start_seed=seed, block=block)
         result |= {f"{name}/{measure}": value for measure, value in means(measured).items()}
     return result
 

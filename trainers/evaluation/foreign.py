@@ -98,12 +98,13 @@ class ForeignPolicy(TensorDictModuleBase):
             return self.policy(tensordict)[keys.ACTION]
         if began.all():
             self.state = None
-        parts: Any = {key[-1]: tensordict.get(key) for key in self.observed}
+        if isinstance(self.policy, OnnxPolicy):
+            action, self.state = self.policy(tensordict, self.state)
+            return action
+        parts = {key[-1]: tensordict.get(key) for key in self.observed}
         if not isinstance(self.policy, nn.Module):
             parts = {name: part.cpu().numpy() for name, part in parts.items()}
         observation = parts if len(parts) > 1 else next(iter(parts.values()))
-        if isinstance(self.policy, OnnxPolicy):
-            observation = tensordict
         if self._stateful:
             action, self.state = self.policy(observation, self.state)
         else:
