@@ -60,10 +60,8 @@ def scripted(config: RunConfig, names: Sequence[str]) -> Iterator[Panel]:
 def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, int, Tensor]:
     """Returns the name, the index and the times, [1, X, Y], of a held-out fire.
 
-    Args:
-        text: NAME, INDEX or NAME:INDEX. The defaults are the name of `shown_scenario` and
-            the index 0.
-        run: configuration of the run; the fires of its evaluation are known as well.
+    `text` is NAME, INDEX or NAME:INDEX, by default the name of `shown_scenario` and the index 0.
+    The fires of the run's evaluation are known as well.
     """
     usual, evaluated = shown_scenario(run), evaluation_scenarios(run)
     name, colon, index = (usual if text is None else str(text)).rpartition(":")

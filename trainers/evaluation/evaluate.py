@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -53,7 +53,7 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
     The policy adds no noise. A UserError if an action is NaN or infinite.
     """
     world: Any = env.base_env
-    steps: list[TensorDictBase] = []
+    steps: list[Any] = []
     actions: list[Tensor] = []
     with torch.no_grad():
         td = env.reset()
@@ -72,7 +72,7 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
             td = step_mdp(td, keep_other=True)
     if not torch.stack(actions).isfinite().all():
         raise UserError("an action of the policy is NaN or infinite")
-    episode: Any = torch.cat(cast(Any, steps), 1)
+    episode: Any = torch.cat(steps, 1)
     return metrics.episode_metrics(episode)
 
 

@@ -139,11 +139,10 @@ class Recorder:
     def recording(self, title: str = "") -> Recording:
         """Returns the recorded episode."""
         steps = {name: np.stack(values) for name, values in self._steps.items()}
-        listens = self._hears or self._config.base is not None
+        listens = self._hears or self._world.base is not None
         ignition, end = (times.numpy() for times in self._whole)
-        world = self._config
         return Recording(
-            title=title, world=world, listens=listens, ignition=ignition, end=end, steps=steps
+            title=title, world=self._world, listens=listens, ignition=ignition, end=end, steps=steps
         )
 
     def _start(self, env: TransformedEnv, policy: Any) -> None:
@@ -154,7 +153,7 @@ class Recorder:
         comm = next(part for part in parts if isinstance(part, CommModule))
         self._advised = policy is None or any(key in comm.out_keys for key in policy.in_keys)
         self._hears = getattr(policy, "hears", False)
-        self._config, self._sensor = world.config, Sensor.of(world.config)
+        self._world, self._sensor = world.config, Sensor.of(world.config)
         arrival, burn_out = world.arrival_time[self.member].cpu(), world.burn_out
         end = torch.full_like(arrival, torch.inf) if burn_out is None else burn_out[self.member]
         self._whole = [whole_steps(times.cpu(), world.config.horizon) for times in (arrival, end)]
@@ -168,7 +167,7 @@ class Recorder:
         looks = alive & (step > 0)  # nobody looks at the reset
         view = self._view(position, looks)
         found = {"view": view}
-        if self._config.radio.bandwidth is not None:  # a radio may say nothing, as it does not fit
+        if self._world.radio.bandwidth is not None:  # a radio may say nothing, as it does not fit
             says = now.get(keys.BYTES_SENT, alive).unsqueeze(1) > 0
             says = nn.functional.pad(says, (0, near.shape[1] - says.shape[2]), value=True)
             near, hears = near & says, hears & says
@@ -176,15 +175,15 @@ class Recorder:
             waits = (one.waits[self.member, :uavs].cpu() for one in self._exchanges)
             found["waits"] = sum(waits, none)
         found |= {"hears": hears, "lost": near & ~hears}
-        if self._config.sensor != (1.0, 1.0):
+        if self._world.sensor != (1.0, 1.0):
             found["missed"] = self._missed(position, looks, key, step, view)
         return found
 
     def _view(self, position: Tensor, looks: Tensor) -> Tensor:
         """Returns the first and last cells in view along x and y, int16 [1, n, 4]."""
-        reach = position[..., 2:] * math.tan(math.radians(self._config.view_angle))
+        reach = position[..., 2:] * math.tan(math.radians(self._world.view_angle))
         bounds, found = [], looks
-        for axis, side in enumerate(self._config.grid):
+        for axis, side in enumerate(self._world.grid):
             near = (torch.arange(side) - position[..., axis, None]).abs() <= reach
             found = found & near.any(-1)
             last = side - 1 - near.flip(-1).int().argmax(-1)
