@@ -16,6 +16,22 @@ def test_held_actions(tell, method, world):
     )
 
 
+LIMITS = ("bandwidth=64", "shared=true", "delay=5", "loss=0.2", "burst=5", "fade=true")
+
+
+@pytest.mark.parametrize("limits", [LIMITS, LIMITS[:1], ("bandwidth=16",)])
+@pytest.mark.parametrize(
+    ("method", "world"),
+    [("maps", "front"), ("consensus", "front"), ("positional", "front"), ("independent", "relay")],
+)
+def test_limits_of_the_radio(tell, method, world, limits):
+    """32 environments, held actions: a step with limits beside one without."""
+    keys = [f"env.radio.{limit}" for limit in limits]
+    works = [flying(strong(method, 32, f"world={world}", *k, hold=10), 5) for k in ([], keys)]
+    free, limited = in_turns(9, *works)
+    tell(f"{method:11} in {world}, {' '.join(limits)}: {limited / free:.2f} x a step without")
+
+
 @pytest.mark.parametrize("scenario", ["discovery", "sampling", "simple_spread"])
 def test_beside_vmas(tell, scenario):
     pytest.importorskip("vmas")
