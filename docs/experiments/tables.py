@@ -166,6 +166,9 @@ def figures() -> dict[str, Figure]:
     return {
         "gains": gains(**known["gains"]),
         "learning": curves("study_front", of_maps, ["front/coverage"]),
+        "learning_relay": curves(
+            "study_relay", of_maps, ["front/base_coverage_auc", "front/coverage"]
+        ),
         "tuned_first": curves("tuned", methods, panels[:3]),
         "tuned_last": curves("tuned", methods, panels[3:]),
     }

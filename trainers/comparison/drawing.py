@@ -72,7 +72,7 @@ def training(
             if curve["low"].notna().all():
                 ends = curve["low"], curve["high"]
                 axes.fill_between(curve["episode"], *ends, color=colours[label], alpha=0.18, lw=0)
-        axes.set(xlabel="episode of training", ylabel=CURVES[measure])
+        axes.set(xlabel="episode of training", ylabel=CURVES.get(measure, measure))
         axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
         axes.grid(alpha=0.3)
     return _with_legend(figure, panels[0])
