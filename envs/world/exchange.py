@@ -48,8 +48,8 @@ class Exchange(nn.Module):
     """
 
     pending: Tensor
-    """int8 [envs, r, items]: 0 for entries that no radio in range lacks, `_OPEN` for those of which
-    something has changed since this was judged, `_LACKING` for other ones"""
+    """int8 [envs, r, items]: 0 for entries that all radios in range have, `_OPEN` for entries that
+    are to be judged at the next step, `_LACKING` for entries that a radio in range lacks"""
     rank: Tensor
     """int32 [envs, r, items]: higher for entries to be said earlier within a limit, 0 for others"""
     contact: Tensor
@@ -89,6 +89,8 @@ class Exchange(nn.Module):
         self.config, self.bits, self.header = config, unit.bit_length(), header
         self.wait, items = 2 * config.delay + 2, len(sizes)
         (envs, radios), self.shape = shape, (*shape, items)
+        self.smallest = int(sizes.min())
+        self.larger = int((sizes > self.smallest).sum())
         self.register_buffer("sizes", sizes, persistent=False)
         self.register_buffer("_first", own_maps(*self.shape), persistent=False)
         self.register_buffer("pending", torch.zeros(self.shape, dtype=torch.int8))
@@ -244,9 +246,9 @@ class Exchange(nn.Module):
 
     def _best(self, row: Tensor, left: Tensor) -> Tensor:
         """Returns the entries of the highest ranks in rows of maps, as many as the bytes allow."""
-        items, least = self.shape[2], int(self.sizes.min())
+        items = self.shape[2]
         # Where the smallest entry fits, at most all the larger ones are passed over.
-        most = int(left.max()) // least + int((self.sizes > least).sum())
+        most = int(left.max()) // self.smallest + self.larger
         left = left.view(-1, 1)[row]
         rank, item = self.rank.flatten(0, 1)[row].topk(min(most, items))
         size = self.sizes[item]

@@ -137,7 +137,7 @@ class TrainedPolicy(TensorDictSequential):
 
     @property
     def title(self) -> str:
-        """The run and what was changed; the world is named anyway."""
+        """The method, setup, world, seed and changed settings; the world `paper` is not named."""
         config = self.config
         world = [] if config.world == "paper" else [f"world {config.world}"]
         changes = [text for text in self.changes if not text.startswith("world=")]
