@@ -201,7 +201,8 @@ class Communication(Transform):
         # Bytes of learned messages are counted at decisions, and not at every step.
         counted = self.message_bytes > 0 and self.module.world.measures == "all"
         counted |= self.module.world.reports
-        takes_part = self.module.every_step or counted or self.module.maps is not None
+        spells = self.listens and self.module.world.radio.burst > 1  # which go on at every step
+        takes_part = self.module.every_step or counted or spells or self.module.maps is not None
         self._joined = getattr(world, "hold", 1) > 1 and takes_part
         if self._joined:
             world.join(self._steered if self.module.steers else None, self._stepped)

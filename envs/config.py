@@ -57,7 +57,7 @@ class RadioConfig:
     @property
     def packets(self) -> bool:
         """Whether messages go one link at a time, as they are late or limited."""
-        return self.delay > 0 or self.bandwidth is not None
+        return self.range > 0 and (self.delay > 0 or self.bandwidth is not None)
 
 
 LARGEST_SCALE = 16

@@ -243,6 +243,8 @@ class WildfireEnv(EnvBase):
         time, position = self._time.clone(), self._position.float()
         hits, flies = torch.zeros_like(position, dtype=torch.bool), self._alive(time)
         counts = self._map.seen_count.clone(), *self._map.count(time), None
+        if self._measures is not None and self.config.base is not None:  # spells of losses begin
+            self._measures.channel(self._position, self._step_key, time)
         nothing = Sighting.nothing(position, self._side**2)
         start = Moved(time, flies, position, hits, nothing, *counts)
         return self._snapshot(start).update(self._measured())

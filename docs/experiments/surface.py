@@ -98,7 +98,9 @@ def main(name: str, *words: str) -> None:
                 with path.open("a") as file:
                     file.write(json.dumps(found[played]) + "\n")
     finally:
-        draw(found, policies or [*{played[0]: 0 for played in found}], changes, Path(f"{name}.png"))
+        drawn = policies or [*{played[0]: 0 for played in found}]
+        if found:
+            draw(found, drawn, changes, Path(f"{name}.png"))
 
 
 main(*sys.argv[1:])

@@ -269,6 +269,7 @@ class Measures(nn.Module):
             flies = None if alive is None else alive[number]
             gone = cell[row // envs == number]
             told.append(self._report(looks, now, links, ignited[number], gone, times))
+            told[-1] *= 1 if flies is None else flies
             known.append(self.base_seen.clone())
             if self._world.reports:
                 said.append(self.said * (1 if flies is None else flies))

@@ -47,6 +47,17 @@ def test_both_ways_of_seeding_are_equivalent():
     assert not starts(make(seed=4)).equal(starts(set_later))
 
 
+def test_an_episode_with_a_base_and_spells_of_losses_repeats():
+    chosen = {"world": "relay", "env.radio.loss": 0.5, "env.radio.burst": 200.0}
+    env, told = make_env("independent", num_envs=8, fire=torch.zeros(60, 60), **chosen), []
+    for _ in range(2):
+        env.set_seed(0)
+        torch.manual_seed(0)  # of the actions
+        told.append(env.rollout(30)["next", keys.BASE_SEEN])
+    assert told[0].any()
+    assert told[0].equal(told[1])
+
+
 @pytest.mark.filterwarnings("error")
 def test_done_per_agent():
     env = make(agent_done=True)

@@ -65,6 +65,7 @@ WORLDS = {
     "lost messages, failures, burning out": (10, LOST),
     "base, limited radio": (4, [*BASED, "env.radio.bandwidth=90", "env.radio.range=15.0"]),
     "late, bursty, limited": (5, [*BASED, "env.radio.delay=7", "env.radio.bandwidth=90", *BURSTS]),
+    "spells of losses": (5, ["env.radio.loss=0.5", "env.radio.burst=20.0"]),
     "late": (5, ["env.measures=all", "env.radio.delay=2"]),
     "window": (10, ["env.observation=window", "env.observation_scale=raw", *LOST]),
     "map": (10, ["env.observation=map", *LOST]),
@@ -90,7 +91,7 @@ def make_pair(method: str, hold: int, options: list[str]):
         *(("independent", "plain"), ("positional", "window"), ("consensus", "map")),
         *((method, "base, limited radio") for method in ("consensus", "maps")),
         *((method, "late, bursty, limited") for method in ("consensus", "maps")),
-        ("positional", "late"),
+        *(("positional", "late"), ("positional", "spells of losses")),
     ],
 )
 def test_a_held_action_equals_its_steps_one_by_one(method, world):

@@ -136,13 +136,14 @@ def telling_apart(settings: Frame) -> list[str]:
 def radio_text(settings: Mapping[str, Any]) -> str:
     """Returns the radio of an evaluation, such as "off", "no limits" or "range 10, loss 0.2"."""
     reach, loss, most, burst, delay, fade, shared = (settings.get(key) for key in RADIO)
-    if reach is not None and float(reach) == 0:
+    reach = math.inf if reach is None else float(reach)
+    if reach == 0:
         return "off"
-    parts = [] if reach is None or math.isinf(float(reach)) else [f"range {word(float(reach))}"]
+    parts = [f"range {word(reach)}"] if reach < math.inf else []
     parts += [f"loss {word(loss)}"] if loss else []
     parts += [f"spells of {word(burst)}"] if loss and burst not in (None, 1) else []
     parts += [f"delay {word(delay)}"] if delay else []
-    parts += ["fade"] if fade else []
+    parts += ["fade"] if fade and reach < math.inf else []
     parts += [f"{word(most)} bytes{' shared' * bool(shared)}"] if most is not None else []
     return ", ".join(parts) or "no limits"
 

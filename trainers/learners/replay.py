@@ -45,8 +45,10 @@ class TeamReplay:
     ):
         uavs, shared, self.device = context.num_uavs, context.shared_replay, context.device
         rows = -(-buffer_size // uavs) if shared else buffer_size
-        # The run cannot fill more rows.
-        self.capacity = min(rows, -(-context.total_steps // decisions) * context.num_envs)
+        # The run cannot fill more rows; the last one of an episode may be padded.
+        episodes, rest = divmod(context.total_steps, context.horizon)
+        most = episodes * -(-context.horizon // decisions) + -(-rest // decisions)
+        self.capacity = min(rows, most * context.num_envs)
         self.needed = -(-batch_size // uavs) if shared else batch_size
         """rows that hold a full batch"""
         first = -(-self.needed // context.num_envs) * decisions

@@ -19,8 +19,8 @@ from emberlink.policies.scripted.map_greedy import MapGreedy
 class KnownMaps:
     """Shows the UAVs' own maps in the form that scripted policies read.
 
-    A UAV also knows the targets of the UAVs that it hears. Such a target may depend on cells that
-    it receives one step later, or never with `env.radio.bandwidth`.
+    A UAV also knows the targets of the UAVs that it hears, unless messages are late. Such a target
+    may depend on cells that it receives one step later, or never with `env.radio.bandwidth`.
 
     Args:
         maps: the maps of the environment's communication.
@@ -35,7 +35,8 @@ class KnownMaps:
     def update(self, tensordict: TensorDictBase) -> None:
         """Reads the maps, which are updated already, and the links of a time step, if any."""
         nobody = torch.zeros_like(self._maps.stamp, dtype=torch.bool)
-        self.reach = tensordict.get(keys.HEARS, nobody)
+        late = self._maps.world.radio.delay > 0
+        self.reach = nobody if late else tensordict.get(keys.HEARS, nobody)
         self._last, self._state = self._maps.sightings()
 
     @property

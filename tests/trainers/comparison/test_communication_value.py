@@ -76,7 +76,8 @@ def test_a_resample_without_anything_to_gain_leaves_no_interval(tmp_path):
 
 
 def test_a_value_is_undetermined_where_no_limits_may_gain_nothing(tmp_path):
-    run = write_run(tmp_path, learned={"coverage": [60.0, 60, 60, 60]})
+    faded = ("env.radio.fade=true",)  # which loses nothing where the range is infinite
+    run = write_run(tmp_path, learned={"coverage": [60.0, 60, 60, 60]}, overrides=faded)
     at_range(run, 0.0, learned=[50.0, 50, 50, 50])
     at_range(run, float("inf"), learned=[40.0, 80, 80, 45])
     (row,) = values(tmp_path)
@@ -124,16 +125,16 @@ def test_with_a_base_scripted_policies_need_the_other_radios(tmp_path):
 
 
 def test_without_a_base_map_greedy_plays_as_alone_and_as_all_with_the_other_radios():
-    pairs = (("map_greedy_alone", "0"), ("map_greedy_all", ".inf"))
-    for other, reach in pairs:
+    silent, all_hear = ["env.radio.range=0", "env.radio.bandwidth=16"], ["env.radio.range=.inf"]
+    pairs = ("map_greedy_alone", silent, 0), ("map_greedy_all", all_hear, 2 * 20 * 20 + 8)
+    for other, radio, sent in pairs:
         choices = ("world=front", "env.horizon=60", "env.grid=[20,20]", "env.num_uavs=3")
         world = resolve("independent", choices)
-        changed = resolve("independent", [*choices, f"env.radio.range={reach}"])
+        changed = resolve("independent", [*choices, *radio])
         fires = evaluation_fires(world, 2)["front"]
         expected = play_blocks(world, SCRIPTED.find(other), fires, block=2)
         actual = play_blocks(changed, SCRIPTED.find("map_greedy"), fires, block=2)
         assert {k: v for k, v in actual.items() if k != "bytes_per_step"} == {
             k: v for k, v in expected.items() if k != "bytes_per_step"
         }
-        sent = 0.0 if reach == "0" else 2 * 20 * 20 + 8
         assert expected["bytes_per_step"] == actual["bytes_per_step"] == [sent, sent]

@@ -47,8 +47,9 @@ def taught(hold: int, *more: str):
     return build_env(config, num_envs=2, fire=times, seed=5, device="cpu", teacher="map_greedy")
 
 
-def test_without_a_radio_the_teacher_is_map_greedy():
-    env = taught(1, "env.radio.range=0")
+@pytest.mark.parametrize("radio", ["env.radio.range=0", "env.radio.delay=119"])
+def test_without_messages_the_teacher_is_map_greedy(radio):
+    env = taught(1, radio)
     policy = MapGreedy(env.base_env)
     td = env.reset()
     for step in range(60):
@@ -109,7 +110,7 @@ def test_the_share_of_the_teacher_and_the_learning_rate_fall_to_zero():
 
 def test_a_memory_learns_from_sequences_that_begin_with_its_state():
     """Ten decisions of an episode are stored as 3 + 3 + 3 + 1; none is stored twice."""
-    setup = made(*GRU, "env.failures=2")
+    setup = made(*GRU, "env.failures=2", "learner.buffer_size=600")
     learner, rollouts, rows = setup.learner, [], []
     learn, extend = learner.learn, learner.replay.extend
     learner.learn = lambda rollout: rollouts.append(rollout.clone()) or learn(rollout)
@@ -126,6 +127,9 @@ def test_a_memory_learns_from_sequences_that_begin_with_its_state():
         assert row["memory"].equal(flight["memory"][:, first])
     assert rows[1]["memory"].any()
     assert not rows[0]["memory"].any()
+    for _ in range(3):
+        setup.dry_run(20)
+    assert len(learner.replay) == learner.replay.written == 4 * 4 * 2
     batch = learner.replay.sample()
     total, weight = torch.zeros(3), torch.zeros(3)
     for entry in range(len(batch)):

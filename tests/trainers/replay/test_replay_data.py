@@ -57,7 +57,7 @@ def test_numbers_of_every_step_are_those_of_the_environment(episode, data):
 
 def test_a_limited_radio_records_what_waits_and_the_links_of_those_that_speak(data):
     (plain,) = data["panels"]
-    limits = "env.radio.bandwidth=12", "env.radio.delay=2", "env.radio.loss=0"
+    limits = "env.radio.bandwidth=12", "env.radio.delay=2", "env.radio.loss=0", "env.reward.base=1"
     limited = play_small(*limits)
     (panel,) = data_of(Replay([limited.recording], "").html)["panels"]
     assert not {"delay", "waits"} & {*plain}
@@ -65,6 +65,7 @@ def test_a_limited_radio_records_what_waits_and_the_links_of_those_that_speak(da
     assert [[*row] for row in zip(*panel["waits"], strict=True)] == limited.waits
     assert {n > 0 for row in limited.waits for n in row} == {True, False}
     for step, now in enumerate(limited.steps):
+        assert step == 0 or not now[keys.REWARD][~now[keys.ALIVE]].any()
         for source, sent in enumerate(now[keys.BYTES_SENT].tolist()):
             heard = [panel["hears"][4 * taker + source][step] == "1" for taker in range(3)]
             assert heard == (now[keys.HEARS][:, source] & (sent > 0)).tolist()
