@@ -116,7 +116,8 @@ def main(verb: str, output: str, *parts: str) -> int:
         ]
         check = ["world", "check", world, "setup=strong", *settings_of_world, "--json"]
         if chosen and world != "paper" and not (folder / "scripted.json").exists():
-            folder.mkdir(parents=True, exist_ok=True)
+            if verb == "run":
+                folder.mkdir(parents=True, exist_ok=True)
             jobs.append(iter([[*check, str(folder / "scripted.json")]]))
         jobs.extend(chosen)
     with ThreadPoolExecutor(os.cpu_count() if verb == "run" else 1) as threads:

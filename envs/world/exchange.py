@@ -28,8 +28,8 @@ class Exchange(nn.Module):
 
     An entry that it has heard is left to the speaker, unless it is in contact with a radio whose
     messages the speaker is not known to have acknowledged lately: else each radio of a clique would
-    tell all others what one has told. What a speaker said in the last `CONTACT` steps before it
-    left or failed may stay with its hearers.
+    tell all others what one has told. An entry that a speaker says in the last `CONTACT` steps
+    before it leaves or fails may never reach the others.
 
     A radio knows others from their messages alone: who was in range lately, which entries a radio
     has said, and which messages it has acknowledged. An acknowledgement is part of the next

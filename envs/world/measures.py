@@ -266,13 +266,13 @@ class Measures(nn.Module):
         every = zip(*self.channel(position.double(), rng_key, step, alive), strict=True)
         for number, (now, links) in enumerate(zip(step, every, strict=True)):
             looks = View(*(part[number] for part in view))
-            flies = None if alive is None else alive[number]
+            flies = 1 if alive is None else alive[number]
             gone = cell[row // envs == number]
-            told.append(self._report(looks, now, links, ignited[number], gone, times))
-            told[-1] *= 1 if flies is None else flies
+            new = self._report(looks, now, links, ignited[number], gone, times)
+            told.append(new * flies)
             known.append(self.base_seen.clone())
             if self._world.reports:
-                said.append(self.said * (1 if flies is None else flies))
+                said.append(self.said * flies)
         return torch.stack(told), torch.stack(known), torch.stack(said) if said else None
 
     def _report(
