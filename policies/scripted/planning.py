@@ -19,6 +19,17 @@ HERE = 2.0
 """cells added to distances, so that no cell is at distance 0"""
 
 
+class Rally(NamedTuple):
+    """Stores where each UAV has to be, and from which step on."""
+
+    place: Tensor
+    """float32 [envs, n, 2], cells"""
+    reach: Tensor
+    """float32 [envs, n]: greatest distance from the place, cells"""
+    step: Tensor
+    """float32 [envs, n]; inf for a UAV that does not have to be anywhere"""
+
+
 class Searcher(Scripted, ABC):
     """Flies to the cells above which UAVs see the highest sum of weights per cost.
 
@@ -57,14 +68,14 @@ class Searcher(Scripted, ABC):
         due = tensordict.get(keys.STEP) % self.period == 0
         if due.any():
             target = torch.where(due.view(-1, 1, 1), self.plan(tensordict), target)
-        return self.fly_over(tensordict.set(self.TARGET, target), target)
+        return self.fly(tensordict.set(self.TARGET, target), self.above(target))
 
     @abstractmethod
     def plan(self, tensordict: TensorDictBase) -> Tensor:
         """Returns a new target of each UAV, float [num_envs, n, 2], cells."""
 
     def search(
-        self, step: Tensor, ground: Tensor, weight: Tensor, hears: Tensor, rally: "Rally | None"
+        self, step: Tensor, ground: Tensor, weight: Tensor, hears: Tensor, rally: Rally | None
     ) -> Tensor:
         """Returns targets from which UAVs come to where they have to be in time.
 
@@ -77,10 +88,17 @@ class Searcher(Scripted, ABC):
         cost, speed = distance + HERE, self.world.displacement
         if rally is None:
             return self.choose(ground, weight, cost, hears)[0]
+        along_x = (rally.place[..., :1] - self.columns).unsqueeze(-1)
+        along_y = (rally.place[..., 1:] - self.rows).unsqueeze(-2)
+        apart = torch.hypot(along_x, along_y) - rally.reach[..., None, None]
+        needs = (apart.clamp(min=0) / speed + PASSING) * (apart > 0)
         arrives = step.view(-1, 1, 1, 1) + distance / speed
-        cost.masked_fill_(rally.too_late((self.columns, self.rows), arrives, speed), math.inf)
+        cost.masked_fill_(arrives + needs > rally.step[..., None, None], math.inf)
         target, value = self.choose(ground, weight, cost, hears)
-        leaves = rally.leaves(ground, step, speed, self.period) & (value <= 0)
+        # A UAV without a target leaves for its place if the next plan would be too late.
+        apart = torch.linalg.vector_norm(rally.place - ground, dim=-1) - rally.reach
+        needs = apart.clamp(min=0) / speed + PASSING + self.period
+        leaves = (apart > 0) & (step.unsqueeze(-1) + needs >= rally.step) & (value <= 0)
         return torch.where(leaves.unsqueeze(-1), rally.place, target)
 
     def distance(self, ground: Tensor) -> Tensor:
@@ -144,41 +162,3 @@ def next_report(step: Tensor, every: int, horizon: int) -> Tensor:
         step: int64 [envs], steps since the episode began.
     """
     return ((step // every + 1) * every).clamp(max=horizon).unsqueeze(-1).float()
-
-
-class Rally(NamedTuple):
-    """Stores where each UAV has to be, and from which step on."""
-
-    place: Tensor
-    """float32 [envs, n, 2], cells"""
-    reach: Tensor
-    """float32 [envs, n]: greatest distance from the place, cells"""
-    step: Tensor
-    """float32 [envs, n]; inf for a UAV that does not have to be anywhere"""
-
-    def too_late(self, cells: tuple[Tensor, Tensor], arrives: Tensor, speed: float) -> Tensor:
-        """Returns whether a UAV that flies to a cell first is late, bool [envs, n, X, Y].
-
-        Args:
-            cells: the places of the cells along x, [X], and along y, [Y].
-            arrives: float32 [envs, n, X, Y], the step at which the UAV arrives at the cell.
-            speed: cells per step.
-        """
-        along_x = (self.place[..., :1] - cells[0]).unsqueeze(-1)
-        along_y = (self.place[..., 1:] - cells[1]).unsqueeze(-2)
-        apart = torch.hypot(along_x, along_y) - self.reach[..., None, None]
-        outside = apart > 0
-        needs = (apart.clamp(min=0) / speed + PASSING) * outside
-        return arrives + needs > self.step[..., None, None]
-
-    def leaves(self, ground: Tensor, step: Tensor, speed: float, period: int) -> Tensor:
-        """Returns whether a UAV has to leave for its place before the next plan, bool [envs, n].
-
-        Args:
-            ground: float32 [envs, n, 2], positions, cells.
-            step, period: int64 [envs], and steps between plans.
-            speed: cells per step.
-        """
-        apart = torch.linalg.vector_norm(self.place - ground, dim=-1) - self.reach
-        needs = apart.clamp(min=0) / speed + PASSING + period
-        return (apart > 0) & (step.unsqueeze(-1) + needs >= self.step)
