@@ -32,6 +32,7 @@ class Scripted(TensorDictModuleBase):
 
     low: torch.Tensor
     high: torch.Tensor
+    """corners of the map, float64 [3], at the `search_altitude`, cells"""
 
     def __init__(self, env: WildfireEnv):
         super().__init__()
@@ -40,7 +41,7 @@ class Scripted(TensorDictModuleBase):
         writes: list[Any] = [keys.ACTION]
         self.in_keys, self.out_keys = reads, writes
         low, high = motion.corners(self.world.low, self.world.high)
-        high[2] = search_altitude(self.world)
+        low[2] = high[2] = search_altitude(self.world)
         self.radius = view_radius(high[2].item(), self.world.view_angle)
         """half the side of the square in view from the altitude of flight, cells"""
         self.stride = self.world.displacement
@@ -70,10 +71,10 @@ class Scripted(TensorDictModuleBase):
         way = target - tensordict.get(keys.POSITION)
         return tensordict.set(keys.ACTION, motion.towards(way, self.stride))
 
-    def fly_over(self, tensordict: TensorDictBase, place: torch.Tensor) -> TensorDictBase:
-        """Writes the action that flies to the `search_altitude` above places, [num_envs, n, 2]."""
-        ceiling = self.high[2:].to(place.dtype).expand_as(place[..., :1])
-        return self.fly(tensordict, torch.cat((place, ceiling), -1))
+    def above(self, place: torch.Tensor) -> torch.Tensor:
+        """Returns the points at the `search_altitude` above places, float [num_envs, n, 2]."""
+        altitude = self.high[2:].to(place.dtype).expand_as(place[..., :1])
+        return torch.cat((place, altitude), -1)
 
     def carried(self, tensordict: TensorDictBase, key: str, initial: torch.Tensor) -> torch.Tensor:
         """Returns the tensor under `key`; `initial`, [num_envs, ...], where an episode begins."""

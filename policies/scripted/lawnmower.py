@@ -59,9 +59,7 @@ class Lawnmower(Scripted):
     def _waypoint(self, flight: Tensor) -> Tensor:
         """Returns the waypoint at the end of each UAV's flight, float32 [num_envs, n, 3], cells."""
         phase = flight % self.period
-        ground = self.path[self.first + torch.minimum(phase, self.period - phase)]
-        ceiling = self.high[2:].float().expand_as(ground[..., :1])
-        return torch.cat((ground, ceiling), -1)
+        return self.above(self.path[self.first + torch.minimum(phase, self.period - phase)])
 
 
 def search_path(grid: tuple[int, int], radius: float) -> Tensor:

@@ -8,11 +8,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from emberlink.envs import keys
+from emberlink.envs.config import RadioConfig
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import radio
 from emberlink.envs.world.knowledge import step_type
 from emberlink.policies.scripted.planning import REPORT, Rally, Searcher, band, next_report
-from emberlink.policies.scripted.team_maps import TARGET_BYTES, Messages, TeamMaps
+from emberlink.policies.scripted.team_maps import TARGET_BYTES, TeamMaps
 
 _NEAR = 2  # cells; within this distance of known fire a cell may have ignited
 _SPREAD = 50.0  # steps; time scale at which the chance of ignition near known fire grows
@@ -46,7 +47,8 @@ class MapGreedy(Searcher):
     """
 
     hears: ClassVar[bool] = True
-    messages: ClassVar[Messages] = "in range"
+    talks: ClassVar[RadioConfig | None] = None
+    """the radio over which UAVs exchange maps and targets; None for the world's"""
     TARGET: ClassVar[str] = "_map_greedy_target"
     flown: ClassVar[float] = 2.0
     claim: ClassVar[float] = 2.0
@@ -59,7 +61,7 @@ class MapGreedy(Searcher):
 
     def __init__(self, env: WildfireEnv, maps: Any = None):
         super().__init__(env)
-        self.maps = TeamMaps(env, self.messages).to(env.device) if maps is None else maps
+        self.maps = TeamMaps(env, self.talks).to(env.device) if maps is None else maps
         for name, reach in (("near", _NEAR), ("around", _AROUND)):
             for axis, side in zip("xy", self.world.grid, strict=True):
                 self.register_buffer(f"_{name}_{axis}", band(side, reach).to(env.device))
@@ -106,14 +108,14 @@ class MapGreedyAlone(MapGreedy):
     """Searches as `map_greedy`; each UAV knows its own sightings and target alone."""
 
     hears: ClassVar[bool] = False
-    messages: ClassVar[Messages] = "none"
+    talks: ClassVar[RadioConfig | None] = RadioConfig(range=0.0)
 
 
 class MapGreedyAll(MapGreedy):
     """Searches as `map_greedy`; each UAV knows what all have seen and plan, at any distance."""
 
     hears: ClassVar[bool] = False
-    messages: ClassVar[Messages] = "everyone"
+    talks: ClassVar[RadioConfig | None] = RadioConfig(range=math.inf)
 
 
 class Courier(MapGreedy):
@@ -152,11 +154,11 @@ class ShuttleAlone(Shuttle):
     """Searches as `shuttle`; each UAV knows its own sightings and target alone."""
 
     hears: ClassVar[bool] = False
-    messages: ClassVar[Messages] = "none"
+    talks: ClassVar[RadioConfig | None] = RadioConfig(range=0.0)
 
 
 class ShuttleAll(Shuttle):
     """Searches as `shuttle`; each UAV knows what all have seen and plan, at any distance."""
 
     hears: ClassVar[bool] = False
-    messages: ClassVar[Messages] = "everyone"
+    talks: ClassVar[RadioConfig | None] = RadioConfig(range=math.inf)

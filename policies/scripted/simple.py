@@ -47,10 +47,9 @@ class RandomWaypoints(Scripted):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         position = tensordict.get(keys.POSITION)
         key = self.step_key(tensordict, Use.SCRIPTED_WAYPOINT)
-        low = torch.cat((self.low[:2], self.high[2:]))
         # At the first step the waypoint is the UAV's position, so a new one is drawn.
         old = self.carried(tensordict, self.WAYPOINT, position)
-        waypoint = motion.next_waypoint(old, position, key, low, self.high)
+        waypoint = motion.next_waypoint(old, position, key, self.low, self.high)
         tensordict.set(self.WAYPOINT, waypoint)
         return self.fly(tensordict, waypoint)
 

@@ -1,12 +1,13 @@
 """Keeps the belief maps of the UAVs for scripted policies."""
 
-from typing import Literal
+from dataclasses import replace
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from emberlink.envs import keys
+from emberlink.envs.config import RadioConfig
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.exchange import Exchange, cell_bytes, share, step_bytes
@@ -16,7 +17,6 @@ from emberlink.envs.world.sensor import Sensor
 
 TARGET_BYTES = 8
 """two float32 numbers"""
-Messages = Literal["none", "in range", "everyone"]
 
 
 class TeamMaps(nn.Module):
@@ -27,8 +27,7 @@ class TeamMaps(nn.Module):
 
     Args:
         env: the environment that the policy acts in.
-        messages: whose maps a UAV takes over at each step: nobody's, the UAVs' and the base's whose
-            messages arrive, or all UAVs'.
+        radio: over which UAVs exchange maps; if None, the world's, which the base has as well.
     """
 
     reach: Tensor
@@ -38,13 +37,11 @@ class TeamMaps(nn.Module):
     _start: Tensor
     _own: Tensor
 
-    def __init__(self, env: WildfireEnv, messages: Messages):
+    def __init__(self, env: WildfireEnv, radio: RadioConfig | None):
         super().__init__()
-        self._env, self._world, self._messages = (env,), env.config, messages
-        world, envs = env.config, env.num_envs
-        self._sensor = Sensor.of(world)
-        listens, settings = world.base is not None and messages == "in range", world.radio
-        packets = messages == "in range" and settings.packets
+        world, envs = replace(env.config, radio=radio or env.config.radio), env.num_envs
+        self._env, self._world, self._sensor = (env,), world, Sensor.of(world)
+        listens, settings = world.base is not None and radio is None, world.radio
         area = self._sensor.area + world.num_uavs
         self.known = Knowledge(
             envs=envs,
@@ -52,11 +49,11 @@ class TeamMaps(nn.Module):
             area=area,
             horizon=world.horizon,
             listeners=int(listens),
-            fires=packets,
+            fires=settings.packets,
         )
         self.channel, self.exchange = Channel(world, envs, base=listens), None
         radios = world.num_uavs + listens
-        if packets:
+        if settings.packets:
             sizes = torch.full((area,), cell_bytes(world.horizon))
             sizes[self._sensor.area :] = 2 + step_bytes(world.horizon)  # of a UAV, and the step
             # A target is said at once, or not at all: late, all have chosen already.
@@ -69,10 +66,9 @@ class TeamMaps(nn.Module):
         self.register_buffer("_own", own.unsqueeze(-1), persistent=False)
 
     @property
-    def sends(self) -> bool | Tensor:
-        """Whether the UAVs send their maps; a tensor is bool [envs, 1]."""
-        in_range = self._messages == "in range" and self._world.radio.range > 0
-        return in_range or self._messages == "everyone"
+    def sends(self) -> bool:
+        """Whether the UAVs send their maps."""
+        return self._world.radio.range > 0
 
     def update(self, tensordict: TensorDictBase) -> None:
         """Adds the sightings and messages of a time step; forgets all where an episode begins."""
@@ -89,15 +85,10 @@ class TeamMaps(nn.Module):
         cells = torch.cat((cells, self._own), -1)
         in_view = torch.nn.functional.pad(in_view, (0, 1), value=True)
         in_view &= (alive & ~begins.unsqueeze(-1)).unsqueeze(-1)
-        if self._messages == "in range":
-            links = self.channel(position, *given, alive)
-        else:
-            every = alive.unsqueeze(-1) & alive.unsqueeze(-2)
-            hears = every & (self._messages == "everyone")
-            links = hears, hears
+        links = self.channel(position, *given, alive)
         self.sent = share(self.known, self.exchange, View(cells, in_view, in_view), step, *links)
         self.reach.copy_(self.known.reach)
-        if self._world.radio.delay and self.exchange is not None:
+        if self._world.radio.delay:
             self.reach.zero_()
 
     @property

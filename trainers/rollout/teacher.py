@@ -126,7 +126,7 @@ def find(name: str) -> type[MapGreedy]:
     known = {
         other: policy
         for other, policy in ((other, SCRIPTED.find(other)) for other in SCRIPTED.known())
-        if issubclass(policy, MapGreedy) and policy.messages == "in range"
+        if issubclass(policy, MapGreedy) and policy.hears
     }
     if name not in known:
         raise UserError(f"learner.teacher={unknown(name, known)}")
