@@ -76,10 +76,6 @@ class BeliefMaps(nn.Module):
         observation[keys.CROPS] = Unbounded(pictures, device=device, dtype=torch.uint8)
         return observation
 
-    def start_episodes(self, mask: Tensor) -> None:
-        """Forgets everything in the environments of a mask, bool [envs]."""
-        self.known.start_episodes(mask)
-
     @property
     def looks(self) -> Tensor:
         """The entries of cells in `known`, integers [envs, n, area]."""
@@ -126,9 +122,11 @@ class BeliefMaps(nn.Module):
 
     def show(self, tensordict: TensorDictBase, due: Tensor) -> None:
         """Writes the pictures; redraws the environments of a mask, bool [envs]."""
-        env = due.nonzero().squeeze(-1)
-        if len(env):
-            self.crops[env] = self._draw(tensordict, env)
+        each = due.unsqueeze(-1).expand(-1, self.world.num_uavs).nonzero()
+        if len(each):
+            for rows in each.split(self.pictures.rows):
+                env, uav = rows.unbind(-1)
+                self.crops[env, uav] = self._draw(tensordict, env, uav)
         tensordict.set(keys.CROPS, self.crops.clone())
 
     def sightings(self) -> tuple[Tensor, Tensor]:
@@ -141,24 +139,20 @@ class BeliefMaps(nn.Module):
         known = self.sensor.crop(self.looks)
         return known >> 2, known & 3
 
-    def _draw(self, tensordict: TensorDictBase, env: Tensor) -> Tensor:
-        """Returns the pictures of some environments, uint8 [len(env), n, ...]."""
-        uavs, seen = self.world.num_uavs, self.known.seen_fire
+    def _draw(self, tensordict: TensorDictBase, env: Tensor, uav: Tensor) -> Tensor:
+        """Returns the pictures of some UAVs, int64 [rows] each, uint8 [rows, ...]."""
+        seen, area = self.known.seen_fire, self.sensor.area
         assert seen is not None
-        own = torch.eye(uavs, dtype=torch.bool, device=env.device)
-        heard = self.stamp[env].masked_fill(own, -1)
-        others = _nearest(self.place[env][..., :2])
-        centre = _nearest(tensordict.get(keys.POSITION)[env][..., :2])
-        base = self._base.expand(len(env), uavs, *self._base.shape)
-        step = tensordict.get(keys.STEP)[env].unsqueeze(-1).expand(-1, uavs)
-        drawn = self.pictures.draw(
-            self.sensor.crop(self.looks[env]).flatten(0, 1),
-            self.sensor.crop(seen[env, :, : self.sensor.area]).flatten(0, 1),
-            step.flatten(),
-            centre.flatten(0, 1),
-            tuple(x.flatten(0, 1) for x in (others, heard, base)),
+        own = uav.unsqueeze(-1) == torch.arange(self.world.num_uavs, device=uav.device)
+        return self.pictures.draw(
+            self.sensor.crop(self.looks[env, uav]),
+            self.sensor.crop(seen[env, uav, :area]),
+            tensordict.get(keys.STEP)[env],
+            _nearest(tensordict.get(keys.POSITION)[env, uav, :2]),
+            _nearest(self.place[env, uav, :, :2]),
+            self.stamp[env, uav].masked_fill(own, -1),
+            self._base.expand(len(uav), *self._base.shape),
         )
-        return drawn.unflatten(0, (len(env), uavs))
 
     def _vector(self, position: Tensor, step: Tensor) -> Tensor:
         """Returns scaled altitude, time and, if wanted, x and y, float32 [envs, n, k]."""

@@ -11,7 +11,6 @@ CHANNELS = ("fire", "seen", "burnt_out", "near", "age", "outside", "uavs", "base
 _FULL = 255
 _OLD = 1000.0  # steps; the age of the darkest known cells
 _SPREAD = 50.0  # steps; time scale at which the chance of ignition near known fire grows
-_DRAWN = 2**17  # cells of maps that are drawn at a time; their sums fit into a cache
 # Bits of an int64 at which the sum over a pixel begins: counts of 10 bits, sums of bytes of 16.
 _FIRE, _SEEN, _BURNT_OUT, _NEAR, _AGE, _END = 0, 10, 20, 30, 46, 62
 
@@ -80,30 +79,16 @@ class Crops(nn.Module):
         self.register_buffer("_edges", torch.tensor(edges), persistent=False)
 
     @property
+    def rows(self) -> int:
+        """The number of maps to draw at a time, whose sums fit into a cache."""
+        return max(1, 2**17 // math.prod(self.grid))
+
+    @property
     def shape(self) -> tuple[int, int, int, int]:
         """The shape of pictures: scales, channels, and pixels along both sides."""
         return len(self.scales), len(CHANNELS), self.pixels, self.pixels
 
     def draw(
-        self, known: Tensor, seen: Tensor, step: Tensor, centre: Tensor, points: tuple[Tensor, ...]
-    ) -> Tensor:
-        """Returns the pictures, uint8 [rows, *shape].
-
-        Args:
-            known: integers [rows, X, Y], 4 times the step of the last look plus the cell's state
-                then (0 no fire, 1 fire, 2 burnt out), -1 for never.
-            seen: bool [rows, X, Y], whether a cell was seen while it burned.
-            step: int64 [rows], steps since the episode began.
-            centre: int64 [rows, 2], the cell nearest to the UAV.
-            points: cells of other UAVs, int64 [rows, k, 2], the step at which they are known, int64
-                [rows, k], -1 for never, and the cell of the base, int64 [rows, 0 or 1, 2].
-        """
-        block = max(1, _DRAWN // (self.grid[0] * self.grid[1]))
-        parts = zip(*(x.split(block) for x in (known, seen, step, centre, *points)), strict=True)
-        drawn = [self._draw(*part) for part in parts]
-        return drawn[0] if len(drawn) == 1 else torch.cat(drawn)
-
-    def _draw(
         self,
         known: Tensor,
         seen: Tensor,
@@ -113,6 +98,18 @@ class Crops(nn.Module):
         heard: Tensor,
         base: Tensor,
     ) -> Tensor:
+        """Returns the pictures, uint8 [rows, *shape].
+
+        Args:
+            known: integers [rows, X, Y], 4 times the step of the last look plus the cell's state
+                then (0 no fire, 1 fire, 2 burnt out), -1 for never.
+            seen: bool [rows, X, Y], whether a cell was seen while it burned.
+            step: int64 [rows], steps since the episode began.
+            centre: int64 [rows, 2], the cell nearest to the UAV.
+            uavs: int64 [rows, k, 2], the cells of other UAVs.
+            heard: int64 [rows, k], the step at which they are known, -1 for never.
+            base: int64 [rows, 0 or 1, 2], the cell of the base.
+        """
         table = self._summed(known, seen, step)
         age = self._ages.take((step.unsqueeze(-1) - heard).clamp(0, len(self._ages) - 1))
         bright = torch.where(heard >= 0, _FULL - age, 0)
@@ -133,7 +130,7 @@ class Crops(nn.Module):
             age = age.minimum((age & 3) + most)
         kind = age.mul_(4).add_(seen, alpha=2)
         if self.spread:
-            kind += _widened((known & 3 == 1) & (known >= 0), self.spread)
+            kind += _widened(known & 3 == 1, self.spread)
         fields = self._fields.index_select(0, kind.flatten()).view_as(kind)
         # The sums overflow; their differences, which fit into the fields, are exact all the same.
         return torch.nn.functional.pad(fields.cumsum(2).cumsum(1), (1, 0, 1, 0))

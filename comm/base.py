@@ -1,24 +1,22 @@
 """Defines communication modules and the transform that adds one to an environment."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Transform
 
 from emberlink.comm._belief import BeliefMaps
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.world import radio
 
 
-class CommModule(TensorDictModuleBase):
+class CommModule(nn.Module):
     """Rewrites the UAVs' observations, such as from the messages that they receive.
 
     A subclass in its own file, `comm/<name>.py`, is a new communication method; the file name is
@@ -50,6 +48,8 @@ class CommModule(TensorDictModuleBase):
     it, a module neither shapes nor steers, and each step sends the bytes of the decision"""
     units: ClassVar[tuple[str, ...]] = ()
     """settings that define the observation's units; an evaluation with other values warns"""
+    out_keys: ClassVar[Sequence[Any]] = (keys.OBSERVATION,)
+    """the keys that `forward` writes"""
     hold: int = 1
     """steps from one decision of the policy to the next (`policy.hold`); between them, no policy
     reads observations"""
@@ -60,9 +60,6 @@ class CommModule(TensorDictModuleBase):
         super().__init__()
         self.world, self.config, self.num_envs = world, config, num_envs
         self.maps = BeliefMaps(world, num_envs) if world.observation == "map" else None
-        default: list[Any] = [keys.OBSERVATION]
-        self.in_keys = getattr(self, "_in_keys", default)  # a subclass may define class attributes
-        self.out_keys = getattr(self, "_out_keys", default)
 
     def specs(self, observation: Composite) -> Composite:
         """Returns the environment's observation spec, with the entries that `forward` writes."""
@@ -210,18 +207,16 @@ class Communication(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        self._check_keys(tensordict_reset)
-        mask = tensordict.get("_reset", None)
-        if mask is None:
-            everywhere = torch.ones(
-                self.module.num_envs, dtype=torch.bool, device=tensordict_reset.device
-            )
-            return self._begin(tensordict_reset, everywhere)
-        mask = mask.flatten()
-        before = {name: buffer.clone() for name, buffer in self.module.state_dict().items()}
-        result = self._begin(tensordict_reset, mask)
+        module, mask = self.module, tensordict.get("_reset", None)
+        everywhere = torch.ones_like(tensordict_reset.get(keys.STEP), dtype=torch.bool)
+        mask = everywhere if mask is None else mask.flatten()
+        before = {name: buffer.clone() for name, buffer in module.state_dict().items()}
+        module.reset(tensordict_reset, mask)
+        if module.maps is not None:
+            module.maps.known.start_episodes(mask)
+        result = self._heard(tensordict_reset)
         # The other environments are within an episode; their state must not change.
-        for name, buffer in self.module.state_dict().items():
+        for name, buffer in module.state_dict().items():
             began = mask.view(-1, *[1] * (buffer.ndim - 1))
             buffer.copy_(torch.where(began, buffer, before[name]))
         return result
@@ -263,13 +258,6 @@ class Communication(Transform):
             last.set(key, value[-1])
         return last, changed
 
-    def _begin(self, tensordict: TensorDictBase, mask: Tensor) -> TensorDictBase:
-        """Starts the episodes of the environments of a mask, bool [num_envs]."""
-        self.module.reset(tensordict, mask)
-        if self.module.maps is not None:
-            self.module.maps.start_episodes(mask)
-        return self._heard(tensordict)
-
     def _heard(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Communicates at a time step that no reward leads to, or at which none changes."""
         module = self.module
@@ -307,18 +295,6 @@ class Communication(Transform):
             total = total + self.message_bytes * (says if left is None else says & (left >= 0))
         return {keys.BYTES_SENT: total}
 
-    def _check_keys(self, tensordict: TensorDictBase) -> None:
-        """Checks that the environment and the transforms before this one write every input key."""
-        for key in self.module.in_keys:
-            if key != keys.HEARS and tensordict.get(key, None) is None:
-                source = "the environment or a transform before the communication"
-                if key in (keys.WINDOW, keys.SIGHT):
-                    source = f"env.observation={'window' if key == keys.WINDOW else 'map'}"
-                raise UserError(
-                    f"key {key} is missing: {type(self.module).__name__} reads it; it comes from "
-                    f"{source}"
-                )
-
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
         if not self._joined or self.module.world.measures != "all":
             return reward_spec
@@ -329,16 +305,15 @@ class Communication(Transform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         spec = observation_spec.clone()
-        *batch, uavs = spec[keys.AGENTS].shape
+        agents = spec[keys.AGENTS].shape
         if self.listens:
-            shape = torch.Size((*batch, uavs, uavs))
-            spec[keys.HEARS] = Binary(shape=shape, device=spec.device, dtype=torch.bool)
+            pairs = torch.Size((*agents, agents[-1]))
+            spec[keys.HEARS] = Binary(shape=pairs, device=spec.device, dtype=torch.bool)
+        whole = Unbounded(agents, device=spec.device, dtype=torch.int64)
         if keys.BUDGET in self._writes:
-            shape = torch.Size((*batch, uavs))
-            spec[keys.BUDGET] = Unbounded(shape, device=spec.device, dtype=torch.int64)
+            spec[keys.BUDGET] = whole.clone()
         if self.module.world.measures == "all":
-            shape = torch.Size((*batch, uavs))
-            spec[keys.BYTES_SENT] = Unbounded(shape, device=spec.device, dtype=torch.int64)
+            spec[keys.BYTES_SENT] = whole
         maps = self.module.maps
         return self.module.specs(spec if maps is None else maps.specs(spec))
 

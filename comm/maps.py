@@ -1,6 +1,6 @@
 """Exchanges the belief maps of UAVs by radio, and brings UAVs home."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from pydantic.dataclasses import dataclass
@@ -46,8 +46,6 @@ class Maps(CommModule):
     hears: ClassVar[bool] = True
     heeds_packets: ClassVar[bool] = True
     maps: BeliefMaps  # pyright: ignore[reportIncompatibleVariableOverride]
-    said: Tensor
-    """int64 [num_envs, n]: the bytes said at the last step"""
     home: Tensor
     """float32 [num_envs, n, 3]: each UAV's place in a chain to the base and its reach, cells"""
     _base: Tensor
@@ -59,29 +57,34 @@ class Maps(CommModule):
                 f"env.observation={world.observation}: comm.name=maps exchanges the UAVs' maps, "
                 "which they have with env.observation=map"
             )
-        inputs: list[Any] = [keys.POSITION, keys.HEARS, keys.ALIVE, keys.STEP]
-        self.in_keys = inputs
         agents, area = (num_envs, world.num_uavs), self.maps.sensor.area
-        self.area, later = area, world.radio.delay
         sizes = torch.full((area + world.num_uavs,), cell_bytes(world.horizon))
         sizes[area:] = 2 + step_bytes(world.horizon) + 12  # UAV, step, three float32 numbers
         self.messages = Exchange(world.radio, sizes, agents, unit=4)
-        self.places = radio.Late(later, num_envs, torch.tensor(0.0), *agents[1:] * 2, 3)
+        pairs = world.num_uavs, world.num_uavs
+        self.places = radio.Late(world.radio.delay, num_envs, torch.tensor(0.0), *pairs, 3)
         self.register_buffer("home", torch.zeros(*agents, 3, dtype=torch.float32))
-        self.register_buffer("said", torch.zeros(agents, dtype=torch.int64))
         base = torch.tensor(world.base or (0.0, 0.0), dtype=torch.float32)
         self.register_buffer("_base", base, persistent=False)
-        self._brings_home = config.home and hears_home(world)
+        reached = world.base is not None and world.radio.range > world.altitude[1]
+        self._brings_home = config.home and reached
 
     def reset(self, tensordict: TensorDictBase, mask: Tensor) -> None:
         """Forgets who was in range."""
         self.messages.start_episodes(mask)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._talk(tensordict)
-        env = (tensordict.get(keys.STEP) % self.hold == 0).nonzero().squeeze(-1)
-        if self._brings_home and len(env):
-            self.home[env] = self._find_home(tensordict, env)
+        maps, step, left = self.maps, tensordict.get(keys.STEP), tensordict.get(keys.BUDGET, None)
+        self.messages.saw(maps.view)
+        hears = tensordict.get(keys.HEARS)
+        self._said, _, new = self.messages(maps.known, hears, step, left)
+        places, area = self.places(step, maps.place.clone()), maps.sensor.area
+        env, hearer, speaker, entry = new[:, new[3] >= area]
+        uav = entry - area
+        maps.place[env, hearer, uav] = places[env, speaker, uav]
+        due = (step % self.hold == 0).nonzero().squeeze(-1)
+        if self._brings_home and len(due):
+            self.home[due] = self._find_home(tensordict, due)
         return tensordict
 
     @property
@@ -97,31 +100,14 @@ class Maps(CommModule):
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
         """Returns the bytes that each UAV said at the last step, int64 [num_envs, n]."""
-        return self.said.clone()
-
-    def _talk(self, tensordict: TensorDictBase) -> None:
-        """Exchanges messages between UAVs in range, and counts the bytes."""
-        maps, step, left = self.maps, tensordict.get(keys.STEP), tensordict.get(keys.BUDGET, None)
-        self.messages.saw(maps.view)
-        sent, _, new = self.messages(maps.known, tensordict.get(keys.HEARS), step, left)
-        places = self.places(step, maps.place.clone())
-        env, hearer, speaker, entry = new[:, new[3] >= self.area]
-        uav = entry - self.area
-        maps.place[env, hearer, uav] = places[env, speaker, uav]
-        self.said.copy_(sent)
+        return self._said
 
     def _find_home(self, tensordict: TensorDictBase, env: Tensor) -> Tensor:
         """Returns the place and reach of UAVs in a chain to the fire, float32 [len(env), n, 3]."""
-        known = self.maps.sensor.crop(self.maps.looks[env])
-        burning = (known >= 0) & (known & 3 == 1)
+        burning = self.maps.sensor.crop(self.maps.looks[env]) & 3 == 1
         step, heard = tensordict.get(keys.STEP)[env], self.maps.stamp[env].clamp(min=0)
         place, reach = radio.chain_to_fire(self.world, self._base, burning, step, heard)
         return torch.cat((place, reach.unsqueeze(-1)), -1)
-
-
-def hears_home(world: WildfireConfig) -> bool:
-    """Returns whether there is a base that hears UAVs at the ceiling."""
-    return world.base is not None and world.radio.range > world.altitude[1]
 
 
 def steer_home(

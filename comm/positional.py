@@ -1,6 +1,6 @@
 """Full communication: method 3 of the paper (section IV.E, algorithm 2)."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from pydantic.dataclasses import dataclass
@@ -39,12 +39,10 @@ class Positional(CommModule):
 
     _own: Tensor
     _order: Tensor
-    """int64 [n * n]: order in which pairs (observer, UAV) are shown with `own_first`"""
+    """int64 [n, n, 1]: the UAVs in the order in which a UAV (row) observes them with `own_first`"""
 
     def __init__(self, world: WildfireConfig, config: PositionalConfig, num_envs: int = 1):
         super().__init__(world, config, num_envs)
-        inputs: list[Any] = [keys.OBSERVATION, keys.POSITION, keys.HEARS, keys.ALIVE, keys.STEP]
-        self.in_keys = inputs
         self.numbers = len(keys.FEATURES if self.maps is None else "xyz")
         sent = world.radio.delay, num_envs
         self.links = Late(*sent, torch.tensor(False), *[world.num_uavs] * 2)
@@ -54,8 +52,8 @@ class Positional(CommModule):
         own = torch.eye(world.num_uavs, dtype=torch.bool)
         self.register_buffer("_own", own, persistent=False)
         uav = torch.arange(world.num_uavs)
-        order = world.num_uavs * uav.unsqueeze(-1) + (uav.unsqueeze(-1) + uav) % world.num_uavs
-        self.register_buffer("_order", order.flatten(), persistent=False)
+        order = (uav.unsqueeze(-1) + uav) % world.num_uavs
+        self.register_buffer("_order", order.unsqueeze(-1), persistent=False)
 
     def specs(self, observation: Composite) -> Composite:
         if self.maps is not None:
@@ -80,8 +78,7 @@ class Positional(CommModule):
         joined = torch.where(hears.unsqueeze(-1), heard.unsqueeze(-3), 0.0)
         joined = torch.where(self._own.unsqueeze(-1), vectors.unsqueeze(-3), joined)
         if self.config.own_first:
-            pairs = joined.flatten(-3, -2).index_select(-2, self._order)
-            joined = pairs.unflatten(-2, joined.shape[-3:-1])
+            joined = joined.take_along_dim(self._order, -2)
         return tensordict.set(keys.OBSERVATION, joined.flatten(-2))
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:

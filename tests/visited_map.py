@@ -15,8 +15,6 @@ class VisitedMap(CommModule):
 
     config_type: ClassVar[type] = NoCommConfig
     hears: ClassVar[bool] = True
-    in_keys: ClassVar = [keys.OBSERVATION, keys.POSITION, keys.HEARS]
-    out_keys: ClassVar = [keys.OBSERVATION]
 
     def __init__(self, world, config, num_envs=1):
         super().__init__(world, config, num_envs)

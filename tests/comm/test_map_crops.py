@@ -19,7 +19,7 @@ def draw(grid, known, seen, step, centre, others, base, **more) -> torch.Tensor:
     heard = torch.tensor([[when for _, when in others]]).view(1, -1).long()
     station = torch.tensor([[base]] if base else []).view(1, -1, 2).long()
     given = known[None], seen[None], torch.tensor([step]), torch.tensor([centre])
-    return crops.draw(*given, (points, heard, station))[0]
+    return crops.draw(*given, points, heard, station)[0]
 
 
 @settings(max_examples=15, deadline=None, derandomize=True)
@@ -62,12 +62,12 @@ def test_the_largest_sums_fit_into_their_bits():
     points = torch.zeros(1, 0, 2).long(), torch.zeros(1, 0).long(), torch.zeros(1, 0, 2).long()
     given = torch.ones(1, *grid, dtype=torch.bool), torch.tensor([HORIZON])
     middle = torch.tensor([[128, 128]])
-    fire, seen, out, near, age, outside, _, _ = crops.draw(never, *given, middle, points)[0, 0]
+    fire, seen, out, near, age, outside, _, _ = crops.draw(never, *given, middle, *points)[0, 0]
     assert (age == 255).all()
     assert (seen == 255).all()
     assert not any(channel.any() for channel in (fire, out, near, outside))
     never[0, 128, 128] = 4 * HORIZON + 1
-    chance = crops.draw(never, *given, middle, points)[0, 0, 3]
+    chance = crops.draw(never, *given, middle, *points)[0, 0, 3]
     assert chance.sum() == round(255 * 24 / 256)
 
 
