@@ -1,6 +1,6 @@
 """Consensus communication: method 4 of the paper (section IV.F, algorithm 3)."""
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from pydantic import Field
@@ -29,8 +29,8 @@ LATE_BYTES = 4
 class HeadingConfig:
     """Stores the settings of the bonus for flying to the target; the defaults are the paper's."""
 
-    form: Literal["folded_linear", "folded_exponential", "linear", "approach"] = "folded_linear"
-    """the formula, a key of `HEADING_FORMS`"""
+    form: Literal["folded_linear", "folded_exponential", "approach"] = "folded_linear"
+    """the formula, see `heading_reward`"""
     weight: Number = 1.0
     """factor of the term"""
     circle: Number = 0.0
@@ -70,6 +70,7 @@ class Consensus(CommModule):
     hears: ClassVar[bool] = True
     heeds_packets: ClassVar[bool] = True
     units: ClassVar[tuple[str, ...]] = ("target",)
+    out_keys = (keys.OBSERVATION, keys.TARGET, keys.FOLLOWS)
     low: Tensor
     high: Tensor
     waypoint: Tensor
@@ -96,10 +97,6 @@ class Consensus(CommModule):
 
     def __init__(self, world: WildfireConfig, config: ConsensusConfig, num_envs: int = 1):
         super().__init__(world, config, num_envs)
-        fire: list[Any] = [keys.NEW_FIRE, keys.OLD_FIRE, keys.NEW_CENTRE, keys.OLD_CENTRE]
-        inputs: list[Any] = [keys.OBSERVATION, keys.POSITION, keys.HEARS, keys.RNG_KEY, keys.STEP]
-        outputs: list[Any] = [keys.OBSERVATION, keys.TARGET, keys.FOLLOWS]
-        self.in_keys, self.out_keys = inputs + fire, outputs
         low, high = motion.corners(world.low, world.high)
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("high", high, persistent=False)
@@ -117,7 +114,6 @@ class Consensus(CommModule):
             self.register_buffer("newest", torch.full((num_envs, *pairs), -1))
             nothing = torch.full((num_envs, *pairs, 5), -1.0, dtype=torch.float64)
             self.register_buffer("received", nothing)
-            self.register_buffer("said", torch.zeros(agents, dtype=torch.int64))
 
     def specs(self, observation: Composite) -> Composite:
         shape, device = observation[keys.AGENTS].shape, observation.device
@@ -155,14 +151,13 @@ class Consensus(CommModule):
             for step in successive(steps, last):
                 self.maps.look(step)
         bonus, sent = self._rewrite(steps, last)
-        return self.show(last), bonus, sent
+        return self.show(last), bonus, sent if self.counts else None
 
-    def _rewrite(
-        self, steps: TensorDictBase, last: TensorDictBase
-    ) -> tuple[Tensor | None, Tensor | None]:
+    def _rewrite(self, steps: TensorDictBase, last: TensorDictBase) -> tuple[Tensor | None, Tensor]:
         """Rewrites the last time step; what depends on the step before is computed in turn."""
         position = steps.get(keys.POSITION)
-        discovers = self._discovers(steps)
+        new, old = steps.get(keys.NEW_FIRE), steps.get(keys.OLD_FIRE)
+        discovers = (new + old if self.config.discoverer == "any_fire" else new) > 0
         rank = self._update_track_record(steps, discovers)
         best = self.config.follow == "best"
         if self.world.radio.packets:
@@ -170,10 +165,10 @@ class Consensus(CommModule):
             places = records[..., 1:4].float()
             cost = -records[..., 4] if best else motion.distance(position.unsqueeze(-2), places)
         else:
-            known = known_discoverers(steps.get(keys.HEARS), discovers, agree=self.config.agree)
+            known, sent = self._agree(steps.get(keys.HEARS), discovers)
             places = position.unsqueeze(-3).expand(*known.shape, 3)
             cost = -rank.unsqueeze(-2) if best else pairwise_distance(position)
-            sent = self._bytes(discovers, known)
+        self.said = sent[-1]
         follows = choose_leader(known, cost, discovers)
         target = self._targets(steps, discovers, follows, places)
         bonus = self._bonus(steps, discovers, follows, target)
@@ -181,22 +176,30 @@ class Consensus(CommModule):
         shown = self._scaled(target[-1] - position[-1] if relative else target[-1])
         last.set(keys.OBSERVATION, torch.cat((last.get(keys.OBSERVATION), shown), -1))
         last.set(keys.FOLLOWS, follows[-1]).set(keys.TARGET, target[-1])
-        return bonus, sent if self.counts else None
+        return bonus, sent
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
-        if self.world.radio.packets:
-            return self.said.clone()
-        discovers = self._discovers(tensordict)
-        known = known_discoverers(tensordict.get(keys.HEARS), discovers, agree=self.config.agree)
-        return self._bytes(discovers, known)
+        return self.said
 
-    def _bytes(self, discovers: Tensor, known: Tensor) -> Tensor:
-        """Returns 16 for each record of a discoverer that a UAV sends, int64 [..., n].
+    def _agree(self, hears: Tensor, discovers: Tensor) -> tuple[Tensor, Tensor]:
+        """Passes on records of discoverers along any path within a step.
 
-        A discoverer sends its own record; other UAVs pass on known records, if they `agree`.
+        A non-discoverer hears the discoverers among its neighbours. Non-discoverers in the same
+        connected sub-network of non-discoverers then share the discoverers that any of them hears,
+        if they `agree`. A discoverer sends its own record alone.
+
+        Args:
+            hears: bool [..., n, n], whether a UAV (row) hears another one (column).
+            discovers: bool [..., n], whether a UAV is a discoverer.
+
+        Returns:
+            The discoverers that each UAV knows, bool [..., n, n]; and the bytes of each UAV, int64
+            [..., n].
         """
-        passed_on = known.sum(-1) * self.config.agree
-        return RECORD_BYTES * torch.where(discovers, 1, passed_on)
+        agree = self.config.agree
+        knows = reachable(hears & ~discovers.unsqueeze(-1)) if agree else hears
+        known = knows & discovers.unsqueeze(-2)
+        return known, RECORD_BYTES * torch.where(discovers, 1, known.sum(-1) * agree)
 
     def _converse(
         self, steps: TensorDictBase, discovers: Tensor, rank: Tensor
@@ -223,7 +226,6 @@ class Consensus(CommModule):
             if budget is not None:
                 order = record[..., 4].masked_fill(~says, -torch.inf).argsort(-1, descending=True)
                 says &= order.argsort(-1) < (budget[number] // size).unsqueeze(-1)
-            self.said.copy_(size * says.sum(-1))
             heard = self.records(now, torch.where(says.unsqueeze(-1), record, -1.0))
             links = self.links(now, hears[number])
             # [num_envs, hearers, speakers, discoverers]
@@ -236,13 +238,8 @@ class Consensus(CommModule):
             self.received.copy_(torch.where(new.unsqueeze(-1), found, -1.0))
             known.append(new)
             records.append(self.received.clone())
-            sent.append(self.said.clone())
+            sent.append(size * says.sum(-1))
         return torch.stack(known), torch.stack(records), torch.stack(sent)
-
-    def _discovers(self, steps: TensorDictBase) -> Tensor:
-        """Returns whether each UAV is a discoverer, bool [..., n]."""
-        new, old = steps.get(keys.NEW_FIRE), steps.get(keys.OLD_FIRE)
-        return (new + old if self.config.discoverer == "any_fire" else new) > 0
 
     def _update_track_record(self, steps: TensorDictBase, discovers: Tensor) -> Tensor:
         """Adds the steps to the track records; returns ranks, float64 [steps, num_envs, n]."""
@@ -335,21 +332,6 @@ class Consensus(CommModule):
         return motion.scale_to_box(shown, self.low, self.high)
 
 
-def known_discoverers(hears: Tensor, discovers: Tensor, *, agree: bool = True) -> Tensor:
-    """Returns the discoverers that each UAV knows after the exchange, bool [..., n, n].
-
-    A non-discoverer hears the discoverers among its neighbours. Non-discoverers in the same
-    connected sub-network of non-discoverers then share the discoverers that any of them hears.
-
-    Args:
-        hears: bool [..., n, n], whether a UAV (row) hears another one (column).
-        discovers: bool [..., n], whether a UAV is a discoverer.
-    """
-    # A discoverer passes on nothing.
-    knows = reachable(hears & ~discovers.unsqueeze(-1)) if agree else hears
-    return knows & discovers.unsqueeze(-2)
-
-
 def choose_leader(known: Tensor, cost: Tensor, discovers: Tensor) -> Tensor:
     """Returns the index of the discoverer that each UAV follows, int64 [..., n].
 
@@ -374,53 +356,25 @@ def _degrees(vector: Tensor) -> Tensor:
     return torch.rad2deg(torch.atan2(vector[..., 1], vector[..., 0]))
 
 
-def _folded_difference(target: Tensor, moved: Tensor) -> Tensor:
-    """Returns | |A_target| - |A_moved| |, degrees; as in the paper, it ignores the signs."""
-    return (_degrees(target).abs() - _degrees(moved).abs()).abs()
-
-
-def _folded_linear(target: Tensor, moved: Tensor) -> Tensor:
-    return (180 - _folded_difference(target, moved)) / 10
-
-
-def _folded_exponential(target: Tensor, moved: Tensor) -> Tensor:
-    return 20 * 0.94 ** _folded_difference(target, moved)
-
-
-def _linear(target: Tensor, moved: Tensor) -> Tensor:
-    """Returns (90 - D) / 90 for an angle D between the vectors; 0 for a UAV that did not move."""
-    difference = (_degrees(target) - _degrees(moved) + 180).remainder(360) - 180
-    return torch.where((moved[..., :2] == 0).all(-1), 0.0, (90 - difference.abs()) / 90)
-
-
-def _approach(target: Tensor, moved: Tensor) -> Tensor:
-    """Returns the cells by which the 3-D distance to the target has decreased."""
-    return torch.linalg.vector_norm(target, dim=-1) - torch.linalg.vector_norm(
-        target - moved, dim=-1
-    )
-
-
-HEADING_FORMS = {
-    "folded_linear": _folded_linear,
-    "folded_exponential": _folded_exponential,
-    "linear": _linear,
-    "approach": _approach,
-}
-"""the formula of each form, of the vector to the target and the vector of the move, [..., 3]"""
-
-
 def heading_reward(before: Tensor, after: Tensor, target: Tensor, config: HeadingConfig) -> Tensor:
     """Computes the heading term, float32 [...].
 
-    Angles are measured in the x-y plane, in degrees, from the position before the move. They are
-    computed in float64: a move of 0.1 cells is a difference of nearly equal float32 numbers.
+    With `approach`, it is the cells by which the 3-D distance to the target has decreased. The
+    other forms are of the paper and its code, whose angles ignore left and right. Angles are
+    measured in the x-y plane, in degrees, from the position before the move. They are computed in
+    float64: a move of 0.1 cells is a difference of nearly equal float32 numbers.
 
     Args:
         before, after: float32 [..., 3], positions before and after the move, cells.
         target: float32 [..., 3], the target that the UAV had before the move, cells.
     """
     before = before.double()
-    term = HEADING_FORMS[config.form](target.double() - before, after.double() - before)
+    way, moved = target.double() - before, after.double() - before
+    if config.form == "approach":
+        left = torch.linalg.vector_norm(way - moved, dim=-1)
+        return (config.weight * (torch.linalg.vector_norm(way, dim=-1) - left)).float()
+    apart = (_degrees(way).abs() - _degrees(moved).abs()).abs()
+    term = (180 - apart) / 10 if config.form == "folded_linear" else 20 * 0.94**apart
     return (config.weight * term).float()
 
 

@@ -104,7 +104,4 @@ def heading_term(form: str, before: Point, after: Point, target: Point) -> float
         return (180 - folded) / 10
     if form == "folded_exponential":
         return 20 * 0.94**folded
-    if before[:2] == after[:2]:
-        return 0.0
-    apart = abs(aimed - moved)
-    return (90 - min(apart, 360 - apart)) / 90
+    return math.dist(before, target) - math.dist(after, target)

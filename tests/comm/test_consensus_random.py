@@ -17,7 +17,7 @@ from emberlink.envs.config import RadioConfig, WildfireConfig
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 
-FORMS = ["folded_linear", "folded_exponential", "linear"]
+FORMS = ["folded_linear", "folded_exponential", "approach"]
 
 
 @pytest.mark.parametrize("uavs", range(1, 17))
