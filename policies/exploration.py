@@ -1,7 +1,7 @@
 """Adds Ornstein-Uhlenbeck noise to the actions for exploration."""
 
 import math
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from pydantic import Field
@@ -39,13 +39,10 @@ class OrnsteinUhlenbeck(Stateful):
     """
 
     def __init__(self, config: ExplorationConfig, uavs: int, generator: torch.Generator):
-        super().__init__()
+        super().__init__(uavs, {NOISE: 3}, reads=[keys.ACTION], writes=[keys.ACTION])
         self.keep = 1 - config.theta * config.dt
         self.shock = config.sigma * math.sqrt(config.dt)
-        self.generator, self.uavs, self.carries = generator, uavs, {NOISE: 3}
-        reads: list[Any] = [keys.ACTION, keys.STEP, NOISE]
-        writes: list[Any] = [keys.ACTION, written(NOISE)]
-        self.in_keys, self.out_keys = reads, writes
+        self.generator = generator
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get(keys.ACTION)

@@ -30,16 +30,13 @@ class GaussianActor(Stateful):
     """
 
     def __init__(self, network: GaussianNetwork, observation_spec: Composite):
-        super().__init__()
-        self.module: Any = network
-        self.observed = keys.observation_keys(observation_spec)
+        observed = keys.observation_keys(observation_spec)
         if network.messages is not None:
-            self.observed.append(keys.HEARS)
-        size = network.size
-        self.uavs, self.carries = network.grouping.uavs, {MEMORY: size} if size else {}
-        reads: list[Any] = [*self.observed, *([keys.STEP, MEMORY] if size else [])]
-        writes: list[Any] = [keys.ACTION, *([written(MEMORY)] if size else [])]
-        self.in_keys, self.out_keys = reads, writes
+            observed.append(keys.HEARS)
+        carries = {MEMORY: network.size} if network.size else {}
+        super().__init__(network.grouping.uavs, carries, reads=observed, writes=[keys.ACTION])
+        self.module: Any = network
+        self.observed = observed
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set(keys.ACTION, self.mean(tensordict).clamp(-1, 1))
@@ -64,10 +61,8 @@ class GaussianExplorer(Stateful):
     """
 
     def __init__(self, actor: GaussianActor, generator: torch.Generator):
-        super().__init__()
-        self.actor, self.generator, self.uavs, self.carries = actor, generator, actor.uavs, {}
-        writes: list[Any] = [*actor.out_keys, LOG_PROB]
-        self.in_keys, self.out_keys = list[Any](actor.in_keys), writes
+        super().__init__(actor.uavs, {}, actor.in_keys, [*actor.out_keys, LOG_PROB])
+        self.actor, self.generator = actor, generator
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         mean = self.actor.mean(tensordict)

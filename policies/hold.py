@@ -29,11 +29,8 @@ class Held(Stateful):
     """
 
     def __init__(self, policy: Any, steps: int, uavs: int):
-        super().__init__()
-        self.policy, self.steps, self.uavs, self.carries = policy, steps, uavs, {HELD: 3}
-        reads: list[Any] = list(dict.fromkeys([*policy.in_keys, keys.STEP, HELD]))
-        writes: list[Any] = [*policy.out_keys, written(HELD)]
-        self.in_keys, self.out_keys = reads, writes
+        super().__init__(uavs, {HELD: 3}, policy.in_keys, policy.out_keys)
+        self.policy, self.steps = policy, steps
         self._inner: list[Any] = [key[1:] for key in policy.out_keys if key[0] == "next"]
 
     @property
@@ -43,16 +40,12 @@ class Held(Stateful):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         decides = tensordict.get(keys.STEP) % self.steps == 0
-        if torch.compiler.is_compiling() or decides.any():  # nobody decides: no networks
-            return self._decide(tensordict, decides)
-        for key in self._inner:
-            tensordict.set(written(key), tensordict.get(key))
-        held = self.state(tensordict, HELD)
-        return tensordict.set(written(HELD), held).set(keys.ACTION, held)
-
-    def _decide(self, tensordict: TensorDictBase, decides: Tensor) -> TensorDictBase:
         before = {key: tensordict.get(key, None) for key in self._inner}
         held = self.state(tensordict, HELD)
+        if not torch.compiler.is_compiling() and not decides.any():  # no networks
+            for key, old in before.items():
+                tensordict.set(written(key), old)
+            return tensordict.set(written(HELD), held).set(keys.ACTION, held)
         acted = self.policy(tensordict)
         for key, old in before.items():
             if old is not None:

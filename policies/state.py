@@ -5,6 +5,7 @@ Keys and sizes are declared in `in_keys`, `out_keys` and a primer, so that Paral
 and `torch.export` keep the state.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -21,12 +22,20 @@ Key = tuple[str, str]
 
 
 class Stateful(TensorDictModuleBase):
-    """A part of a policy that carries tensors of UAVs, float32 [..., uavs, size], 0 at step 0."""
+    """A part of a policy that carries tensors of UAVs, float32 [..., uavs, size], 0 at step 0.
 
-    uavs: int
-    """number of UAVs"""
-    carries: dict[Any, int]
-    """key -> size of what this part itself carries"""
+    Args:
+        uavs: number of UAVs.
+        carries: key -> size of what this part itself carries.
+        reads, writes: its other keys.
+    """
+
+    def __init__(self, uavs: int, carries: dict[Key, int], reads: Sequence[Any], writes: list[Any]):
+        super().__init__()
+        self.uavs, self.carries = uavs, carries
+        state: list[Any] = [keys.STEP, *carries] if carries else []
+        self.in_keys = list(dict.fromkeys([*reads, *state]))
+        self.out_keys = [*writes, *map(written, carries)]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Returns a transform that adds the state to an environment, 0 after each reset."""

@@ -40,10 +40,6 @@ class _Stacked(nn.Module):
         agent_index: whether the index of the UAV is an input.
         team: whether the inputs of a UAV are the observations and actions of its whole team.
         start: see `layers.Start`.
-
-    Raises:
-        ValueError: there are no hidden layers or more than 8, or an observation has an unsupported
-            shape.
     """
 
     def __init__(
@@ -59,8 +55,6 @@ class _Stacked(nn.Module):
         **start: Any,
     ):
         super().__init__()
-        if not 1 <= len(hidden) <= len(LAYER_NAMES):
-            raise ValueError(f"hidden={list(hidden)}: 1 to {len(LAYER_NAMES)} layers are possible")
         self.grouping = Grouping(uavs, shared=share_parameters)
         self.names, self.widest = LAYER_NAMES[: len(hidden)], max(hidden)
         self._dims, self._indexed, self._team = len(observations[0]), agent_index, team
@@ -186,9 +180,6 @@ def make_actor(
         observation_spec, action_spec: of the environment, batch size [num_envs].
         hidden: units of the hidden layers, 1 to 8 layers.
         more: `share_parameters` and `agent_index`, see `StackedActor`; `generator`.
-
-    Raises:
-        ValueError: the number of layers or the shape of an observation is not supported.
     """
     network = _build(StackedActor, observation_spec, action_spec, hidden, **more)
     observed: Any = keys.observation_keys(observation_spec)
@@ -200,7 +191,7 @@ def make_critic(
 ) -> TensorDictModule:
     """Returns the critics of all UAVs, which write `STATE_ACTION_VALUE`.
 
-    Arguments and errors as for `make_actor`; `team` makes critics of the team.
+    Arguments as for `make_actor`; `team` makes critics of the team.
     """
     network = _build(StackedCritic, observation_spec, action_spec, hidden, **more)
     reads: Any = [keys.ACTION, TAKEN, *keys.observation_keys(observation_spec)]

@@ -22,7 +22,7 @@ class WindowEncoder(nn.Module):
 
     Args:
         groups: number of groups of weights.
-        shape: [channels, W, W] of the window, or [channels, X, Y] of a map.
+        shape: [channels, W, W] of the window.
         start: see `layers.Start`.
     """
 
@@ -94,9 +94,6 @@ class ObservationEncoder(nn.Module):
         shapes: shape of each tensor, per UAV: [features], [channels, W, W] or
             [pictures, channels, S, S].
         start: see `layers.Start`.
-
-    Raises:
-        ValueError: there is no encoder for the shape of a tensor.
     """
 
     def __init__(self, groups: int, shapes: Sequence[Sequence[int]], **start: Any):
@@ -104,8 +101,6 @@ class ObservationEncoder(nn.Module):
         self.parts, self.features = nn.ModuleList(), 0
         kinds: dict[int, Any] = {1: nn.Identity, 3: WindowEncoder, 4: PictureEncoder}
         for shape in shapes:
-            if len(shape) not in kinds:
-                raise ValueError(f"no encoder for an observation of shape {list(shape)} per UAV")
             part = kinds[len(shape)](groups, shape, **start)
             self.parts.append(part)
             self.features += shape[0] if len(shape) == 1 else part.features

@@ -138,7 +138,9 @@ class Oracle(Searcher):
             cost, cell = self._nearest(delay, xy)
             chooses = cost.isfinite().unsqueeze(-1) & alive.gather(1, turn)
             target.scatter_(1, uav, torch.where(chooses, cell, xy).unsqueeze(1))
-            self._reserve(delay, cell)
+            near_x = (cell[:, :1] - self.columns).abs() <= self.radius
+            near_y = (cell[:, 1:] - self.rows).abs() <= self.radius
+            delay.masked_fill_(near_x.unsqueeze(-1) & near_y.unsqueeze(-2), math.inf)  # reserved
         return target
 
     def _delay(self, step: Tensor) -> Tensor:
@@ -154,12 +156,6 @@ class Oracle(Searcher):
         distance, index = (self.distance(ground) + delay).flatten(1).min(-1)
         side = len(self.rows)
         return distance, torch.stack((index // side, index % side), -1).double()
-
-    def _reserve(self, delay: Tensor, cell: Tensor) -> None:
-        """Sets `delay` to infinity for all cells in view from a cell, float64 [num_envs, 2]."""
-        near_x = (cell[:, :1] - self.columns).abs() <= self.radius
-        near_y = (cell[:, 1:] - self.rows).abs() <= self.radius
-        delay.masked_fill_(near_x.unsqueeze(-1) & near_y.unsqueeze(-2), math.inf)
 
 
 class OracleShuttle(Oracle):

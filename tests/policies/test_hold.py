@@ -23,8 +23,8 @@ COUNT = (keys.AGENTS, "count")
 class Counting(Stateful):
     """Writes the number of its decisions as the action."""
 
-    uavs, carries = 2, {COUNT: 3}
-    in_keys, out_keys = [keys.STEP, COUNT], [keys.ACTION, ("next", *COUNT)]
+    def __init__(self):
+        super().__init__(2, {COUNT: 3}, reads=[], writes=[keys.ACTION])
 
     def forward(self, tensordict):
         before = tensordict.get(COUNT, None)
