@@ -2,13 +2,14 @@
 
 import secrets
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import make_composite_from_td
 
 from emberlink.envs import keys, metrics
 from emberlink.envs.config import WildfireConfig
@@ -26,32 +27,6 @@ from emberlink.envs.world.reward import step_reward
 from emberlink.envs.world.sensor import Sensor
 
 _DONE = ("done", "terminated", "truncated")
-
-
-class Moved(NamedTuple):
-    """What steps of the world have changed; batch shape [steps, envs], or [envs] of one step."""
-
-    time: Tensor
-    alive: Tensor | None
-    position: Tensor
-    hit_boundary: Tensor
-    sighting: Sighting
-    seen: Tensor
-    burning: Tensor
-    burnt: Tensor
-    reward: Tensor | None = None
-    """None at a reset"""
-    base_seen: Tensor | None = None
-    """None at a reset, and without a base"""
-    said: Tensor | None = None
-    """bytes for the base; None at a reset, and where they are not counted"""
-
-
-def _last(part: Any) -> Any:
-    """Returns the last step of all tensors, [steps, ...] each, of a tuple."""
-    if isinstance(part, tuple):
-        return type(part)(*map(_last, part))
-    return None if part is None else part[-1]
 
 
 class WildfireEnv(EnvBase):
@@ -86,8 +61,7 @@ class WildfireEnv(EnvBase):
     _time: Tensor
     _position: Tensor
     _ahead: Tensor
-    _fail_step: Tensor | None
-    _all_alive: Tensor
+    _fail_step: Tensor
 
     def __init__(
         self,
@@ -116,8 +90,8 @@ class WildfireEnv(EnvBase):
         self._communicate: Callable[..., Any] | None = None
         self._fire_name = fire if isinstance(fire, str) else getattr(fire, "name", None)
         self._make_world(fire)
-        self._make_specs()
         torch.nn.Module.to(self, self.device)  # EnvBase.to does nothing for its own device
+        self._make_specs()
         self._seeded = seed is not None
         if seed is not None:
             seeds = counter_rng.check_seeds(seed, num_envs)
@@ -139,74 +113,29 @@ class WildfireEnv(EnvBase):
         self._measures = Measures(config, num_envs, sensor.area) if measured else None
         for name in ("_seed_key", "_episode", "_episode_key", "_step_key", "_time"):
             self.register_buffer(name, torch.zeros(num_envs, dtype=torch.int64))
-        never = torch.full((num_envs, config.num_uavs), config.horizon + 1)
-        self.register_buffer("_fail_step", never if config.failures else None)
-        flies = torch.ones(num_envs, config.num_uavs, dtype=torch.bool)
-        self.register_buffer("_all_alive", flies, persistent=False)
+        never = torch.full((num_envs, config.num_uavs), torch.iinfo(torch.int64).max)
+        self.register_buffer("_fail_step", never)
         position = torch.zeros(num_envs, config.num_uavs, 3, dtype=torch.float64)
         self.register_buffer("_position", position)
         self.register_buffer("_ahead", torch.arange(1, self.hold + 1)[:, None], persistent=False)
 
     def _make_specs(self) -> None:
         """Declares the tensors that the environment reads and writes; see `keys`."""
-        world, envs = self.config, (self.num_envs,)
-        agents, side = (*envs, self.n_agents), self._side
-
-        def real(*shape: int) -> Unbounded:
-            return Unbounded(torch.Size(shape), dtype=torch.float32)
-
-        def whole(*shape: int) -> Unbounded:
-            return Unbounded(torch.Size(shape), dtype=torch.int64)
-
-        def flag(*shape: int) -> Binary:
-            return Binary(shape=torch.Size(shape), dtype=torch.bool)
-
-        def byte(*shape: int) -> Unbounded:
-            return Unbounded(torch.Size(shape), dtype=torch.uint8)
-
-        def team(**specs: TensorSpec) -> Composite:
-            return Composite({keys.AGENTS: Composite(specs, shape=agents)}, shape=envs)
-
-        per_uav: dict[str, TensorSpec] = {
-            keys.OBSERVATION[1]: real(*agents, len(keys.FEATURES)),
-            keys.POSITION[1]: real(*agents, 3),
-            **{key[1]: whole(*agents) for key in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE)},
-            **{key[1]: real(*agents, 2) for key in (keys.NEW_CENTRE, keys.OLD_CENTRE)},
-            keys.HIT_BOUNDARY[1]: flag(*agents, 3),
-            keys.ALIVE[1]: flag(*agents),
-        }
-        if world.observation == "window":
-            per_uav[keys.WINDOW[1]] = flag(*agents, 3, side, side)
-        if world.observation == "map":
-            per_uav[keys.SIGHT[1]] = byte(*agents, side, side)
-        if world.reports:
-            per_uav[keys.REPORT_BYTES[1]] = whole(*agents)
-        observed = team(**per_uav)
-        for key in (keys.RNG_KEY, keys.STEP, keys.SEEN, keys.BURNING, keys.BURNT):
-            observed[key] = whole(*envs)
-        if world.measures == "all":
-            observed[keys.FRONT_AGE], observed[keys.FRONT_AGE_P95] = real(*envs), real(*envs)
-        if world.base is not None:
-            observed[keys.BASE_SEEN], observed[keys.BASE_AGE] = whole(*envs), real(*envs)
-        if self._shows_map:
-            observed[keys.TRUE_MAP] = byte(*envs, *world.grid)
-        self.observation_spec = observed
+        envs, agents = (self.num_envs,), (self.num_envs, self.n_agents)
+        first = self._first_time_step()
+        flags = [*_DONE, *((keys.AGENTS, name) for name in _DONE if self._agent_done)]
+        self.observation_spec = make_composite_from_td(first.exclude(*flags))
+        self.done_spec = make_composite_from_td(first.select(*flags))
         action = Bounded(-1.0, 1.0, torch.Size((*agents, 3)), dtype=torch.float32)
-        self.action_spec = team(**{keys.ACTION[1]: action})
-        reward = {keys.REWARD[1]: real(*agents, 1)}
-        self.reward_spec = team(**reward)
+        uavs = Composite({keys.ACTION[1]: action}, shape=agents)
+        self.action_spec = Composite({keys.AGENTS: uavs}, shape=envs)
+        first.set(keys.REWARD, torch.zeros(*agents, 1, device=self.device))
+        earned = first.select(keys.REWARD)
         if self.hold > 1:
-            step = Composite({keys.AGENTS: Composite({}, shape=agents)}, shape=envs)
-            for key in metrics.counted(world):
-                step[key] = (reward[key[1]] if key == keys.REWARD else observed[key]).clone()
-            every = step.unsqueeze(1).expand((*envs, self.hold)).clone()
             # Not observed: they belong to the transition, and a reset has none.
-            self.reward_spec = Composite({**team(**reward), keys.STEPS: every}, shape=envs)
-        done = Composite({name: flag(*envs, 1) for name in _DONE}, shape=envs)
-        if self._agent_done:
-            flags = {name: flag(*agents, 1) for name in _DONE}
-            done[keys.AGENTS] = Composite(flags, shape=agents)
-        self.done_spec = done
+            every = first.select(*metrics.counted(self.config)).unsqueeze(1)
+            earned.set(keys.STEPS, every.expand(self.num_envs, self.hold))
+        self.reward_spec = make_composite_from_td(earned)
 
     def load_state_dict(self, *args: Any, **kwargs: Any):
         """Restores a state, its seeds included; see `torch.nn.Module.load_state_dict`."""
@@ -240,14 +169,9 @@ class WildfireEnv(EnvBase):
         self._start_episodes(mask)
         start = self._start_positions(position)
         self._position.copy_(torch.where(mask[:, None, None], start, self._position))
-        time, position = self._time.clone(), self._position.float()
-        hits, flies = torch.zeros_like(position, dtype=torch.bool), self._alive(time)
-        counts = self._map.seen_count.clone(), *self._map.count(time), None
         if self._measures is not None and self.config.base is not None:  # spells of losses begin
-            self._measures.channel(self._position, self._step_key, time)
-        nothing = Sighting.nothing(position, self._side**2)
-        start = Moved(time, flies, position, hits, nothing, *counts)
-        return self._snapshot(start).update(self._measured())
+            self._measures.channel(self._position, self._step_key, self._time)
+        return self._first_time_step()
 
     def _start_episodes(self, mask: Tensor) -> None:
         """Starts the next episode where a mask, bool [num_envs], is true."""
@@ -257,9 +181,8 @@ class WildfireEnv(EnvBase):
         self._time.masked_fill_(mask, 0)
         self._map.start_episodes(mask, self._draw_fire())
         if self._measures is not None:
-            counts = self._map.count(torch.zeros_like(self._time))
-            self._measures.start_episodes(mask, self._map.times[0], *counts)
-        if self._fail_step is not None:
+            self._measures.start_episodes(mask, self._map)
+        if self.config.failures:
             team = self.config.num_uavs, self.config.horizon
             drawn = draw_failures(self._episode_key, self.config.failures, *team)
             self._fail_step.copy_(torch.where(mask[:, None], drawn, self._fail_step))
@@ -294,13 +217,13 @@ class WildfireEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Performs the steps of a held action: all at once, unless each is steered."""
         if self.hold == 1:
-            now = self._advance(tensordict.get(keys.ACTION), 1)
-            return self._snapshot(_last(now)).update(self._measured())
+            step: Any = self._advance(tensordict.get(keys.ACTION), 1)[0]
+            return step.update(self._measured())
         chosen, parts = tensordict.select(keys.ACTION), []
         result: Any = None
         for ahead in self._ahead.split(self.hold if self._steer is None else 1):
             steered = chosen if self._steer is None else self._steer(chosen.copy())
-            steps = self._snapshot(self._advance(steered.get(keys.ACTION), len(ahead)))
+            steps = self._advance(steered.get(keys.ACTION), len(ahead))
             parts.append(steps.select(*metrics.counted(self.config)))
             result = steps[-1]
             if self._communicate is not None:
@@ -311,49 +234,64 @@ class WildfireEnv(EnvBase):
         result.set(keys.STEPS, series).set(keys.REWARD, series.get(keys.REWARD).sum(1))
         return result.update(self._measured())
 
-    def _advance(self, action: Tensor, steps: int) -> Moved:
-        """Performs successive steps of the world with the same action."""
+    def _advance(self, action: Tensor, steps: int) -> TensorDict:
+        """Performs steps of the world with the same action; batch size [steps, num_envs]."""
         time = self._time + self._ahead[:steps]
         alive = self._alive(time)
-        moves = [self._move(action, alive if alive is None else alive[s]) for s in range(steps)]
+        moves = [self._move(action, flies) for flies in alive]
         position, hit_boundary = map(torch.stack, zip(*moves, strict=True))
-        burning, burnt = self._map.count(time)
-        look = self._map.look(position.double(), self._step_key, time, burning, alive)
-        told = base_seen = said = None
+        look = self._map.look(position.double(), self._step_key, time, alive)
+        told, measured = None, {}
         if self._measures is not None:
-            at = position, self._step_key, time, alive, burnt
-            told, base_seen, said = self._measures.update(
-                look.view, look.ended, self._map.times, *at
-            )
+            at = position, self._step_key, time, alive
+            told, measured = self._measures.update(self._map, look, *at)
         new, old, none = look.counts.unbind(-1)
-        flies = self._all_alive if alive is None else alive
         penalised = self.config.reward.unseen != 0
-        unseen = look.unseen.unsqueeze(-1) * flies if penalised else None
+        unseen = look.unseen.unsqueeze(-1) * alive if penalised else None
         reward = step_reward(new, old, none, hit_boundary, self.config.reward, told, unseen)
         self._time.copy_(time[-1])
-        counts = look.seen, burning, burnt, reward.unsqueeze(-1), base_seen, said
-        return Moved(time, alive, position, hit_boundary, look.shown, *counts)
+        counts = look.seen, look.burning, look.burnt
+        after = self._time_steps(time, position, hit_boundary, alive, look.shown, *counts)
+        return after.set(keys.REWARD, reward.unsqueeze(-1)).update(measured)
 
-    def _alive(self, time: Tensor) -> Tensor | None:
-        """Returns which UAVs fly at steps [...], bool [..., n]; None if UAVs never fail."""
-        return None if self._fail_step is None else time.unsqueeze(-1) < self._fail_step
+    def _alive(self, time: Tensor) -> Tensor:
+        """Returns which UAVs fly at steps [...], bool [..., n]."""
+        return time.unsqueeze(-1) < self._fail_step
 
-    def _move(self, action: Tensor, alive: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _move(self, action: Tensor, alive: Tensor) -> tuple[Tensor, Tensor]:
         """Moves the UAVs; returns the positions and the axes of attempted exits, see `motion`."""
-        if alive is not None:
-            action = action.masked_fill(~alive.unsqueeze(-1), 0.0)
+        action = action.masked_fill(~alive.unsqueeze(-1), 0.0)
         box, stride = {"low": self._low, "high": self._high}, self.config.displacement
         moved, hit_boundary = motion.move(self._position, action, displacement=stride, **box)
         self._position.copy_(moved)
         return moved, hit_boundary
 
-    def _snapshot(self, now: Moved) -> TensorDict:
-        """Returns the time steps after steps of the world, batch size [..., num_envs]."""
-        position, sighting, time = now.position, now.sighting, now.time
+    def _first_time_step(self) -> TensorDict:
+        """Returns the time step at which UAVs have not moved or looked yet."""
+        time, position = self._time.clone(), self._position.float()
+        hits = torch.zeros_like(position, dtype=torch.bool)
+        nothing = Sighting.nothing(position, self._side**2)
+        counts = self._map.seen_count.clone(), *self._map.count(time)
+        first = self._time_steps(time, position, hits, self._alive(time), nothing, *counts)
+        if self.config.reports:
+            first.set(keys.REPORT_BYTES, torch.zeros_like(first.get(keys.NEW_FIRE)))
+        return first.update(self._measured())
+
+    def _time_steps(
+        self,
+        time: Tensor,
+        position: Tensor,
+        hit_boundary: Tensor,
+        alive: Tensor,
+        sighting: Sighting,
+        seen: Tensor,
+        burning: Tensor,
+        burnt: Tensor,
+    ) -> TensorDict:
+        """Returns time steps without reward and measures, batch size [..., num_envs]."""
         counts = sighting.counts.long()
         new, old, none = counts.unbind(-1)
         new_centre, old_centre, _ = sighting.centres.unbind(-2)
-        flies = self._all_alive.expand(position.shape[:-1]) if now.alive is None else now.alive
         agents = {
             keys.OBSERVATION[1]: self._observe(position, counts, time),
             keys.POSITION[1]: position,
@@ -362,19 +300,14 @@ class WildfireEnv(EnvBase):
             keys.NO_FIRE[1]: none,
             keys.NEW_CENTRE[1]: new_centre,
             keys.OLD_CENTRE[1]: old_centre,
-            keys.HIT_BOUNDARY[1]: now.hit_boundary,
-            keys.ALIVE[1]: flies.clone(),
+            keys.HIT_BOUNDARY[1]: hit_boundary,
+            keys.ALIVE[1]: alive,
         }
         square = self._side, self._side
         if self.config.observation == "window":
             agents[keys.WINDOW[1]] = sighting.classes.unflatten(-1, square)
         if self.config.observation == "map":
             agents[keys.SIGHT[1]] = sighting.shown().unflatten(-1, square)
-        if self.config.reports:
-            nothing = torch.zeros_like(flies, dtype=torch.int64)
-            agents[keys.REPORT_BYTES[1]] = nothing if now.said is None else now.said
-        if now.reward is not None:
-            agents[keys.REWARD[1]] = now.reward
         done = self._done(time)
         if self._agent_done:
             each = (*position.shape[:-1], 1)
@@ -383,10 +316,9 @@ class WildfireEnv(EnvBase):
             keys.AGENTS: TensorDict(agents, position.shape[:-1], self.device),
             keys.RNG_KEY: self._step_key.expand(time.shape).clone(),
             keys.STEP: time,
-            keys.SEEN: now.seen,
-            keys.BURNING: now.burning,
-            keys.BURNT: now.burnt,
-            **({} if now.base_seen is None else {keys.BASE_SEEN: now.base_seen}),
+            keys.SEEN: seen,
+            keys.BURNING: burning,
+            keys.BURNT: burnt,
             **done,
         }
         return TensorDict(root, time.shape, self.device)
@@ -464,7 +396,7 @@ class WildfireEnv(EnvBase):
     @property
     def fail_step(self) -> Tensor | None:
         """The step from which each UAV has failed, int64 [num_envs, n]; None if none can fail."""
-        return self._fail_step
+        return self._fail_step if self.config.failures else None
 
     @property
     def knowledge(self) -> Knowledge | None:
@@ -481,11 +413,10 @@ class WildfireEnv(EnvBase):
             raise UserError(f"render mode {mode!r} is not known; known: 'rgb_array'")
         from emberlink.envs.rendering.frame import frame  # imports matplotlib
 
-        flies = self._alive(self._time)
         return frame(
             self.fire_map[env].cpu().numpy(),
             self._position[env].cpu().numpy(),
             view_angle=self.config.view_angle,
-            alive=None if flies is None else flies[env].cpu().numpy(),
+            alive=self._alive(self._time)[env].cpu().numpy(),
             base=self.config.base,
         )

@@ -148,6 +148,10 @@ class Look(NamedTuple):
     """the sightings shown to the UAVs; with `own`, new fire is fire new to the UAV"""
     view: View
     """the indices of the cells"""
+    burning: Tensor
+    """int64 [steps, envs]: cells that burn"""
+    burnt: Tensor
+    """int64 [steps, envs]: cells that burn or have burnt out"""
     seen: Tensor
     """int64 [steps, envs]: cells that a UAV has seen while they burned"""
     unseen: Tensor
@@ -269,14 +273,7 @@ class CoverageMap(nn.Module):
             return burnt, burnt.clone()
         return burnt - self._burnt_out.at(self._fire_index, step), burnt
 
-    def look(
-        self,
-        position: Tensor,
-        rng_key: Tensor,
-        step: Tensor,
-        burning: Tensor,
-        alive: Tensor | None = None,
-    ) -> Look:
+    def look(self, position: Tensor, rng_key: Tensor, step: Tensor, alive: Tensor) -> Look:
         """Classifies the cells in view at successive steps and marks the burning ones as seen.
 
         Every step has to be looked at once, and in order.
@@ -285,12 +282,10 @@ class CoverageMap(nn.Module):
             position: float64 [steps, envs, uavs, 3], cells.
             rng_key: int64 [envs], `keys.RNG_KEY`.
             step: int64 [steps, envs], steps since the episode began.
-            burning: int64 [steps, envs], the number of burning cells, from `count`.
-            alive: bool [steps, envs, uavs]; the others see nothing. All are alive if None.
+            alive: bool [steps, envs, uavs]; the others see nothing.
         """
         centre, cells, in_view = self._sensor.look(position, self._start, rng_key, step)
-        if alive is not None:
-            in_view &= alive.unsqueeze(-1)
+        in_view &= alive.unsqueeze(-1)
         time = step[..., None, None].float()
         stamp = step[..., None, None].int() * self._uavs + self._uav
         arrival_time, burnt_out = self._arrival_time.take(cells), None
@@ -315,6 +310,7 @@ class CoverageMap(nn.Module):
             new_count = new_fire.sum(-1, dtype=counts.dtype)
             old_count = counts[..., :2].sum(-1) - new_count
             counts = torch.stack((new_count, old_count, counts[..., 2]), -1)
+        burning, burnt = self.count(step)
         seen = self.seen_count + counts[..., 0].sum(-1).long().cumsum(0)
         unseen, ended = burning - seen, (self._fire_index[:0], self._fire_index[:0])
         if self._burnt_out is not None:
@@ -326,4 +322,5 @@ class CoverageMap(nn.Module):
             unseen = unseen + gone
             self.seen_gone.copy_(gone[-1])
         self.seen_count.copy_(seen[-1])
-        return Look(counts, shown, View(cells, in_view, burns), seen, unseen, ended)
+        view = View(cells, in_view, burns)
+        return Look(counts, shown, view, burning, burnt, seen, unseen, ended)

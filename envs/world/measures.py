@@ -1,13 +1,14 @@
 """Measures the sightings of the team and of the base at each step."""
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.world.coverage_map import View
+from emberlink.envs.world.coverage_map import CoverageMap, Look, View
 from emberlink.envs.world.exchange import Exchange, cell_bytes, share
 from emberlink.envs.world.knowledge import Knowledge, step_type
 from emberlink.envs.world.radio import Channel
@@ -39,18 +40,10 @@ class SightingAges(nn.Module):
 
     since: Tensor
     """integers [envs, area]: the step of the last look at a burning cell, or of its ignition"""
-    burning: Tensor
-    """int64 [envs]: number of burning cells"""
-    since_sum: Tensor
-    """int64 [envs]: sum of `since` over them"""
     waiting: Tensor
-    """int64 [envs, steps]: number of them by `since`"""
+    """int64 [envs, steps]: number of burning cells by `since`"""
     edges: Tensor
     """int64 [envs, ages]: runs that began at an age, less the runs that ended before it"""
-    total: Tensor
-    """int64 [envs]: sum of all ages"""
-    count: Tensor
-    """int64 [envs]: number of ages"""
     _rounded: Tensor
 
     def __init__(self, envs: int, area: int, horizon: int):
@@ -60,8 +53,6 @@ class SightingAges(nn.Module):
         lower = torch.searchsorted(limits, ages, right=True) - 1
         self.register_buffer("_rounded", limits[lower], persistent=False)
         self.register_buffer("since", torch.zeros(envs, area, dtype=step_type(horizon)))
-        for name in ("burning", "since_sum", "total", "count"):
-            self.register_buffer(name, torch.zeros(envs, dtype=torch.int64))
         for name in ("waiting", "edges"):
             self.register_buffer(name, torch.zeros(envs, len(ages), dtype=torch.int64))
 
@@ -74,9 +65,6 @@ class SightingAges(nn.Module):
         """
         began = mask[:, None]
         self.since.copy_(torch.where(began, ignition, self.since))
-        self.burning.copy_(torch.where(mask, burning, self.burning))
-        for record in (self.since_sum, self.total, self.count):
-            record.masked_fill_(mask, 0)
         for record, at in ((self.waiting, 0), (self.edges, 1)):  # ages begin at step 1
             record.masked_fill_(began, 0)
             record[:, at] = torch.where(mask, burning, record[:, at])
@@ -114,37 +102,34 @@ class SightingAges(nn.Module):
         env = row % envs * self.waiting.shape[1]
         self.waiting.view(-1).index_add_(0, env + since, by)
         self.edges.view(-1).index_add_(0, env + now[row] - since, by)
-        change = torch.zeros(2, len(now), dtype=torch.int64, device=now.device)
-        change.index_add_(1, row, torch.stack((by, by * since)))
-        total = torch.stack((self.burning, self.since_sum)).unsqueeze(1)
-        burning, since_sum = total + change.unflatten(1, (steps, envs)).cumsum(1)
-        self.total.add_((burning * now.view(steps, envs) - since_sum).sum(0))
-        self.count.add_(burning.sum(0))
-        self.burning.copy_(burning[-1])
-        self.since_sum.copy_(since_sum[-1])
 
-    def mean(self) -> Tensor:
-        """Returns the mean age, float32 [envs]; 0 without any ages."""
-        return (self.total.double() / self.count.clamp(min=1)).float()
-
-    def percentile(self, share: float, step: Tensor) -> Tensor:
-        """Returns the age that at least a share of all ages do not exceed (nearest rank).
+    def counted(self, step: Tensor) -> Tensor:
+        """Returns the number of ages so far up to 0, 1, ..., int64 [envs, ages].
 
         Args:
-            share: from 0 to 1.
             step: int64 [envs], the step of the last `add`.
-
-        Returns:
-            float32 [envs], rounded down to a limit of `age_limits`; 0 without any ages.
         """
         steps = self.waiting.shape[1]
         now = step.clamp(max=steps - 2).unsqueeze(-1)
         ages = torch.arange(int(now.max()) + 2, device=now.device)
         # Runs that have not ended reach from where they began to the age at this step.
         going_on = self.waiting.gather(1, (now + 1 - ages) % steps)
-        counted = (self.edges[:, : len(ages)] - going_on).cumsum(1).cumsum(1)
+        return (self.edges[:, : len(ages)] - going_on).cumsum(1).cumsum(1)
+
+    def percentile(self, counted: Tensor, share: float) -> Tensor:
+        """Returns the age that at least a share of `counted` do not exceed (nearest rank).
+
+        float32 [envs], rounded down to a limit of `age_limits`; 0 without any ages.
+        """
         rank = (counted[:, -1:].double() * share).ceil()
         return self._rounded.take((counted < rank).sum(-1)).float()
+
+
+def mean_age(counted: Tensor) -> Tensor:
+    """Returns the mean of the ages of `SightingAges.counted`, float32 [envs]; 0 without any."""
+    count = counted[:, -1]
+    total = (count.unsqueeze(-1) - counted).sum(-1)  # ages above 0, above 1, ...
+    return (total.double() / count.clamp(min=1)).float()
 
 
 def number_events(seen: Tensor, ended: Tensor) -> Tensor:
@@ -172,18 +157,13 @@ class Measures(nn.Module):
         area: cells of a padded map (`Sensor.area`).
     """
 
-    burnt: Tensor
-    """int64 [envs]: number of cells that have ignited"""
     base_seen: Tensor
     """int64 [envs]: number of cells with a sighting in flames at the base"""
-    said: Tensor
-    """int64 [envs, uavs]: bytes that UAVs said for the base at the last step"""
 
     def __init__(self, world: WildfireConfig, envs: int, area: int):
         super().__init__()
         self._world, self._area = world, area
         self.knowledge = self.base_ages = self.ages = self.reports = None
-        self.register_buffer("burnt", torch.zeros(envs, dtype=torch.int64))
         if world.measures == "all":
             self.ages = SightingAges(envs, area, world.horizon)
         if world.base is not None:
@@ -198,23 +178,16 @@ class Measures(nn.Module):
             self.base_ages = SightingAges(envs, area, world.horizon)
             self.register_buffer("base_seen", torch.zeros(envs, dtype=torch.int64))
             self.channel = Channel(world, envs, base=True)
-            sizes = torch.full((area,), cell_bytes(world.horizon))
             if world.radio.packets:
-                self.register_buffer("said", torch.zeros(envs, world.num_uavs, dtype=torch.int64))
+                sizes = torch.full((area,), cell_bytes(world.horizon))
                 self.reports = Exchange(world.radio, sizes, (envs, world.num_uavs + 1))
 
-    def start_episodes(self, mask: Tensor, arrival: Tensor, burning: Tensor, burnt: Tensor) -> None:
-        """Starts new episodes in the environments of a mask, bool [envs].
-
-        Args:
-            arrival: float32 [envs, area], steps; NaN outside of the grid.
-            burning, burnt: int64 [envs], cells that burn, and that burn or have burnt out, at
-                step 0.
-        """
-        self.burnt.copy_(torch.where(mask, burnt, self.burnt))
+    def start_episodes(self, mask: Tensor, fire: CoverageMap) -> None:
+        """Starts new episodes in the environments of a mask, bool [envs]."""
+        burning, _ = fire.count(torch.zeros_like(mask, dtype=torch.int64))
         for part in (self.ages, self.base_ages):
             if part is not None:
-                ignition = whole_steps(arrival, self._world.horizon)
+                ignition = whole_steps(fire.times[0], self._world.horizon)
                 part.start_episodes(mask, ignition, burning)
         if self.knowledge is not None:
             self.knowledge.start_episodes(mask)
@@ -224,56 +197,51 @@ class Measures(nn.Module):
 
     def update(
         self,
-        view: View,
-        ended: tuple[Tensor, Tensor],
-        times: tuple[Tensor, Tensor | None],
+        fire: CoverageMap,
+        look: Look,
         position: Tensor,
         rng_key: Tensor,
         step: Tensor,
-        alive: Tensor | None,
-        burnt: Tensor,
-    ) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+        alive: Tensor,
+    ) -> tuple[Tensor | None, dict[Any, Tensor]]:
         """Adds successive steps.
 
         Args:
-            view: the cells in view, [steps, envs, uavs, ...].
-            ended: the cells that burned until a step: rows of the flat [steps, envs] and cells.
-            times: arrival and burn-out times, float32 [envs, area]; None if cells burn for ever.
+            look: the sightings of the steps.
             position: float [steps, envs, uavs, 3], cells.
             rng_key: int64 [envs], `keys.RNG_KEY`.
             step: int64 [steps, envs], steps since the episode began.
-            alive: bool [steps, envs, uavs]; all are alive if None.
-            burnt: int64 [steps, envs], number of cells that have ignited.
+            alive: bool [steps, envs, uavs].
 
         Returns:
             The burnt cells new to the base at each step, for UAVs whose messages arrived there,
-            else 0, int64 [steps, envs, uavs], and `base_seen` after each, int64 [steps, envs];
-            None without a base; and the bytes that each UAV says, like the first, if counted.
+            else 0, int64 [steps, envs, uavs], or None without a base; and by key the measures of
+            each step, [steps, envs, ...].
         """
-        ignited = burnt.diff(dim=0, prepend=self.burnt.unsqueeze(0))
-        self.burnt.copy_(burnt[-1])
-        row, cell = ended
+        ignited = look.burnt - fire.count(step - 1)[1]
+        row, cell = look.ended
         steps, envs = step.shape
         cell = row % envs * self._area + cell
         if self.ages is not None:
             at = torch.arange(steps, device=step.device).view(-1, 1, 1, 1)
-            seen = (view.cells * steps + at)[view.burning]
+            seen = (look.view.cells * steps + at)[look.view.burning]
             events = number_events(seen, cell * steps + row // envs)
             self.ages.add(step, ignited, events)
         if self.knowledge is None:
-            return None, None, None
+            return None, {}
         told, known, said = [], [], []
         every = zip(*self.channel(position.double(), rng_key, step, alive), strict=True)
         for number, (now, links) in enumerate(zip(step, every, strict=True)):
-            looks = View(*(part[number] for part in view))
-            flies = 1 if alive is None else alive[number]
+            view = View(*(part[number] for part in look.view))
             gone = cell[row // envs == number]
-            new = self._report(looks, now, links, ignited[number], gone, times)
-            told.append(new * flies)
+            new, sent = self._report(view, now, links, ignited[number], gone, fire.times)
+            told.append(new)
             known.append(self.base_seen.clone())
-            if self._world.reports:
-                said.append(self.said * flies)
-        return torch.stack(told), torch.stack(known), torch.stack(said) if said else None
+            said += [] if sent is None else [sent[:, :-1]]
+        measured = {keys.BASE_SEEN: torch.stack(known)}
+        if self._world.reports:
+            measured[keys.REPORT_BYTES] = torch.stack(said) * alive
+        return torch.stack(told) * alive, measured
 
     def _report(
         self,
@@ -283,16 +251,14 @@ class Measures(nn.Module):
         ignited: Tensor,
         ended: Tensor,
         times: tuple[Tensor, Tensor | None],
-    ) -> Tensor:
-        """Adds a step to the base's knowledge; returns the burnt cells that it is told."""
+    ) -> tuple[Tensor, Tensor | None]:
+        """Adds a step to the base's knowledge; returns the burnt cells told, and bytes if sent."""
         knowledge, ages = self.knowledge, self.base_ages
         assert knowledge is not None
         assert ages is not None
         assert knowledge.seen_fire is not None
         before = knowledge.last_seen[:, -1].clone()
         sent = share(knowledge, self.reports, view, step, *links)
-        if sent is not None:
-            self.said.copy_(sent[:, :-1])
         after, now = knowledge.last_seen[:, -1].clone(), step.unsqueeze(-1)
         arrival, burn_out = times
         newer = (after > before) & (after > ages.since) & (arrival <= now)
@@ -303,15 +269,16 @@ class Measures(nn.Module):
         seen = knowledge.seen_fire[:, -1].sum(-1)
         told = (seen - self.base_seen).unsqueeze(-1) * knowledge.reach[:, -1, :-1]
         self.base_seen.copy_(seen)
-        return told
+        return told, sent
 
     def values(self, step: Tensor) -> dict[str, Tensor]:
         """Returns the measures of the episode up to a step, int64 [envs], by key, [envs] each."""
         values: dict[str, Tensor] = {}
         if self.ages is not None:
-            values[keys.FRONT_AGE] = self.ages.mean()
-            values[keys.FRONT_AGE_P95] = self.ages.percentile(0.95, step)
+            counted = self.ages.counted(step)
+            values[keys.FRONT_AGE] = mean_age(counted)
+            values[keys.FRONT_AGE_P95] = self.ages.percentile(counted, 0.95)
         if self.knowledge is not None and self.base_ages is not None:
             values[keys.BASE_SEEN] = self.base_seen.clone()
-            values[keys.BASE_AGE] = self.base_ages.mean()
+            values[keys.BASE_AGE] = mean_age(self.base_ages.counted(step))
         return values
