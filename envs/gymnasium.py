@@ -10,11 +10,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict, Space
+from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from emberlink.envs import keys
-from emberlink.envs.pettingzoo import WildfireParallelEnv, parallel_env, to_action
+from emberlink.envs.pettingzoo import WildfireParallelEnv, to_action
 
 
 class WildfireTeamEnv(gymnasium.Env[Any, NDArray[np.float32]]):
@@ -25,37 +26,33 @@ class WildfireTeamEnv(gymnasium.Env[Any, NDArray[np.float32]]):
     failed. `info` holds the numbers of cells `seen`, `burning` and `burnt`.
 
     Args:
-        kwargs: as for `parallel_env`.
+        kwargs: as for `WildfireParallelEnv`.
 
     Raises:
-        UserError: as `parallel_env`.
+        UserError: as `WildfireParallelEnv`.
     """
 
     metadata = WildfireParallelEnv.metadata
 
     def __init__(self, **kwargs: Any):
-        self._team = parallel_env(**kwargs)
+        self._team = WildfireParallelEnv(**kwargs)
         self.render_mode = self._team.render_mode
-        self._ended = False, False
         uavs = len(self._team.possible_agents)
         self.observation_space: Space[Any] = self._team.state_space
-        one: Any = self._team.observation_space("uav_0")
+        one = self._team.observation_space("uav_0")
         if isinstance(one, Dict):
-            spaces: dict[str, Any] = {**one.spaces}
-            for name, box in spaces.items():
-                spaces[name] = Box(box.low.min(), box.high.max(), (uavs, *box.shape), box.dtype)
-            self.observation_space = Dict({**spaces, keys.OBSERVATION[1]: self._team.state_space})
+            each: Any = batch_space(one, uavs)
+            self.observation_space = Dict({**each, keys.OBSERVATION[1]: self._team.state_space})
         self.action_space = Box(-1.0, 1.0, (3 * uavs,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Starts an episode; see `WildfireParallelEnv.reset`."""
         super().reset(seed=seed)
         self._team.reset(seed=seed, options=options)
-        self._ended = False, False
         return self._observed(), self._team.counts()
 
     def step(self, action: NDArray[np.float32]):
-        """Moves all UAVs at once; after the end of an episode, nothing changes.
+        """Moves all UAVs at once.
 
         Raises:
             UserError: the action is not an array of shape [n * 3] without NaN.
@@ -63,11 +60,10 @@ class WildfireTeamEnv(gymnasium.Env[Any, NDArray[np.float32]]):
         every = self._team.possible_agents
         rows = to_action(action, 3 * len(every)).reshape(-1, 3)
         _, rewards, _, truncations, _ = self._team.step(dict(zip(every, rows, strict=True)))
-        if rewards:
-            truncated = any(truncations.values())
-            self._ended = not truncated and not self._team.agents, truncated
+        truncated = any(truncations.values())
+        terminated = not truncated and not self._team.agents
         reward = sum(rewards.values()) / len(every)
-        return self._observed(), reward, *self._ended, self._team.counts()
+        return self._observed(), reward, terminated, truncated, self._team.counts()
 
     def act(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> NDArray[np.float32]:
         """Returns the actions of a policy for `step`; see `WildfireParallelEnv.act`."""

@@ -26,14 +26,15 @@ Observation = Array | dict[str, NDArray[Any]]
 _NOT_INFO = {k for _, k in (*keys.NETWORKS_READ, keys.ACTION, keys.REWARD)}
 
 
-def parallel_env(
-    env: EnvBase | None = None,
-    *,
-    render_mode: str | None = None,
-    max_cycles: int | None = None,
-    **kwargs: Any,
-) -> "WildfireParallelEnv":
-    """Returns the wildfire environment with PettingZoo's parallel API.
+class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
+    """The wildfire environment with PettingZoo's parallel API: agents "uav_0", "uav_1", ...
+
+    All agents are truncated together at the horizon. One that fails (`env.failures`) is terminated
+    and leaves `agents`. `infos` hold, for each agent, the other tensors under ("agents", ...) of
+    the TorchRL environment, and the numbers of cells `seen`, `burning` and `burnt`. With
+    `observation: window` an observation is a dictionary of "observation", float32 [6], and
+    "window", uint8 [3, W, W]; with `observation: map` it has "crops" instead of the window. Before
+    the first reset, methods that need an episode raise a UserError.
 
     Args:
         env: a TorchRL environment of batch size [1] over a `WildfireEnv`, such as
@@ -46,36 +47,6 @@ def parallel_env(
     Raises:
         UserError: another render mode, more than one environment, or `env` beside other settings.
     """
-    if env is not None and (kwargs or max_cycles is not None):
-        given = sorted([*kwargs, *(["max_cycles"] if max_cycles is not None else [])])
-        raise UserError(f"settings cannot be given with an existing environment, got {given}")
-    if env is None:
-        scaled = dataclasses.replace(default_config(kwargs.get("fire")), observation_scale="box")
-        config = kwargs.pop("config", None) or scaled
-        config = dataclasses.replace(config, horizon=max_cycles or config.horizon)
-        env = WildfireEnv(**{"num_envs": 1, "config": config, **kwargs})
-    return WildfireParallelEnv(env, render_mode)
-
-
-def env(**kwargs: Any) -> AECEnv:
-    """Returns the environment with PettingZoo's AEC API; arguments as for `parallel_env`."""
-    return parallel_to_aec(parallel_env(**kwargs))
-
-
-class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
-    """The UAVs of one environment as PettingZoo's agents "uav_0", "uav_1", ...
-
-    All agents are truncated together at the horizon. One that fails (`env.failures`) is terminated
-    and leaves `agents`. `infos` hold, for each agent, the other tensors under ("agents", ...) of
-    the TorchRL environment, and the numbers of cells `seen`, `burning` and `burnt`. With
-    `observation: window` an observation is a dictionary of "observation", float32 [6], and
-    "window", uint8 [3, W, W]; with `observation: map` it has "crops" instead of the window. Before
-    the first reset, methods that need an episode raise a UserError.
-
-    Args:
-        env: see `parallel_env`.
-        render_mode: "rgb_array", "human" or None.
-    """
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
         "name": "emberlink_wildfire_v0",
@@ -84,7 +55,23 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         "is_parallelizable": True,
     }
 
-    def __init__(self, env: EnvBase, render_mode: str | None = None):
+    def __init__(
+        self,
+        env: EnvBase | None = None,
+        *,
+        render_mode: str | None = None,
+        max_cycles: int | None = None,
+        **kwargs: Any,
+    ):
+        if env is not None and (kwargs or max_cycles is not None):
+            raise UserError(f"settings beside an existing environment: {kwargs or max_cycles}")
+        if env is None:
+            scaled = dataclasses.replace(
+                default_config(kwargs.get("fire")), observation_scale="box"
+            )
+            config = kwargs.pop("config", None) or scaled
+            config = dataclasses.replace(config, horizon=max_cycles or config.horizon)
+            env = WildfireEnv(**{"num_envs": 1, "config": config, **kwargs})
         known = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in known:
             raise UserError(f"render_mode {render_mode!r} is not known; known: {known}")
@@ -143,8 +130,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             actions: of the live agents; actions of agents that have left are ignored.
 
         Raises:
-            UserError: an agent is not known, an action of a live agent is missing, does not have
-                three numbers or holds NaN.
+            UserError: an action of a live agent does not have three numbers or holds NaN.
         """
         now, flew = self._begun(), self.agents
         if not flew:
@@ -241,9 +227,6 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
 
     def _stacked(self, actions: dict[str, Array]) -> Array:
         """Returns the actions in the order of the agents, float32 [n, 3]."""
-        missing = set(self.agents) - set(actions)
-        if missing or set(actions) - set(self.possible_agents):
-            raise UserError(f"got actions for {sorted(actions)}; expected those of {self.agents}")
         given = {agent: to_action(actions[agent], 3, agent) for agent in self.agents}
         hover = np.zeros(3, np.float32)
         return np.stack([given.get(agent, hover) for agent in self.possible_agents])
@@ -263,6 +246,15 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         values = {key: value.cpu().numpy().copy() for key, value in told.items()}
         rows = range(len(self.possible_agents))
         return [{key: value[i] for key, value in values.items()} | shared for i in rows]
+
+
+parallel_env = WildfireParallelEnv
+"""the name by which PettingZoo's users look for it"""
+
+
+def env(**kwargs: Any) -> AECEnv:
+    """Returns the environment with PettingZoo's AEC API; arguments as for `parallel_env`."""
+    return parallel_to_aec(parallel_env(**kwargs))
 
 
 def to_action(action: Any, size: int, agent: str = "the team") -> Array:

@@ -91,9 +91,6 @@ def test_the_team_as_one_agent_of_gymnasium():
         assert reward == pytest.approx(after[keys.REWARD].mean().item())
         assert (terminated, truncated) == (False, step == 10)
         assert info["seen"] == after[keys.SEEN].item()
-    last = env.unwrapped.step(action)
-    assert np.array_equal(last[0], observation)
-    assert last[1:] == (0.0, False, True, info)
     env.reset()
     for wrong in (np.zeros(10, np.float32), np.zeros((3, 3), np.float32)):
         with pytest.raises(UserError, match=r"shape \(9,\), got"):
