@@ -3,11 +3,11 @@
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field, Strict, ValidationInfo, field_validator, model_validator
+from pydantic import Field, Strict, ValidationInfo, field_validator
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import STRICT
+from emberlink.envs.utils.validation import STRICT, Range
 
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 """bounded so that the square of a sum over a view cannot overflow float32"""
@@ -87,6 +87,7 @@ BASE_SIDE = 30
 SIDES = (8, 256)
 """minimum and maximum cells along a side of a grid"""
 _Share = Annotated[float, Field(ge=0, le=1)]
+_Altitude = Annotated[float, Field(gt=0, le=256)]
 _Side = Annotated[int, Field(ge=SIDES[0], le=SIDES[1])]
 
 
@@ -100,10 +101,7 @@ class WildfireConfig:
     """UAVs in the team"""
     horizon: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
     """steps of an episode"""
-    altitude: Annotated[
-        tuple[Annotated[float, Field(gt=0, le=256)], Annotated[float, Field(gt=0, le=256)]],
-        Strict(False),
-    ] = (1.0, 4.0)
+    altitude: Range[_Altitude] = (1.0, 4.0)
     """lowest and highest z, cells"""
     view_angle: Annotated[float, Field(gt=0, le=80)] = 30.0
     """half the opening angle of the camera, degrees"""
@@ -150,12 +148,6 @@ class WildfireConfig:
         if value > uavs:
             raise UserError(f"the team has {uavs} UAVs")
         return value
-
-    @model_validator(mode="after")
-    def _altitudes_in_order(self) -> "WildfireConfig":
-        if self.altitude[0] > self.altitude[1]:
-            raise UserError(f"altitude {self.altitude}: the lowest is above the highest")
-        return self
 
     @property
     def reports(self) -> bool:

@@ -30,6 +30,7 @@ from emberlink.envs.world.coverage_map import split_times, with_burn_time
 Grid = tuple[int, int]
 
 
+@dataclasses.dataclass(frozen=True)
 class FireSource(ABC):
     """The fires of a scenario, in three sets: "train", "validation" and "test".
 
@@ -73,7 +74,6 @@ class FireSource(ABC):
         return self.config
 
 
-@dataclasses.dataclass(frozen=True)
 class Generated(FireSource):
     """Fires from seeds."""
 
@@ -81,27 +81,23 @@ class Generated(FireSource):
 
     def fires(self, split: Split, count: int | None, grid: Grid, horizon: int) -> Tensor:
         count = self.config.num_train_fires if count is None else count
-        return self._with_burn_time(fire_bank(self.config, split, count, grid, horizon))
+        times = fire_bank(self.config, split, count, grid, horizon)
+        return with_burn_time(times, self.config.burn_time)
 
     def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
         seeds = fire_seeds("test", index + 1, self.config.test_seed)[index:]
-        return self._with_burn_time(make_fires(self.config, seeds, grid, horizon))
-
-    def _with_burn_time(self, fires: Tensor) -> Tensor:
-        if isinstance(self.config, ReactionConfig):
-            return fires
-        return with_burn_time(fires, self.config.burn_time)
+        times = make_fires(self.config, seeds, grid, horizon)
+        return with_burn_time(times, self.config.burn_time)
 
     def describe(self, count: int) -> dict[str, Any]:
         """Returns their seeds, and the fields of the scenario that differ from their defaults."""
-        fields = dataclasses.fields(self.config)
-        values = {field.name: getattr(self.config, field.name) for field in fields}
-        changed = {f.name: values[f.name] for f in fields if values[f.name] != f.default}
+        defaults = {field.name: field.default for field in dataclasses.fields(self.config)}
+        values = vars(self.config)
+        changed = {key: values[key] for key in defaults if values[key] != defaults[key]}
         seeds = fire_seeds("test", count, self.config.test_seed)
         return {"fire_seeds": seeds.tolist(), "scenario": changed}
 
 
-@dataclasses.dataclass(frozen=True)
 class FromFile(FireSource):
     """Fires of files."""
 

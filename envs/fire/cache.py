@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from emberlink.envs.fire.generator import GeneratedConfig, Split, fire_seeds, make_fires
-from emberlink.envs.fire.reaction import ReactionConfig
 from emberlink.envs.utils.atomic_io import replaced, user_path
 
 GENERATOR_VERSION = 1  # increase it if the same config and seed give another fire
@@ -24,16 +23,6 @@ def cache_folder() -> Path:
     if folder := os.environ.get("EMBERLINK_CACHE"):
         return user_path(folder)
     return user_path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "emberlink"
-
-
-def bank_key(
-    config: GeneratedConfig, split: Split, count: int, grid: tuple[int, int], horizon: int
-) -> str:
-    """Returns a hash of all values on which a bank of fires depends."""
-    ranges = dataclasses.asdict(config)
-    ranges.pop("burn_time", None)
-    parts = [GENERATOR_VERSION, ranges, split, count, *grid, horizon]
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
 
 def fire_bank(
@@ -51,14 +40,14 @@ def fire_bank(
     Returns:
         As `make_fires`, on the CPU, so that every device trains on the same fires.
     """
-    seeds = fire_seeds(split, count, config.test_seed)
-    file = cache_folder() / f"fire-{bank_key(config, split, count, grid, horizon)}.npy"
-    times = (2,) if isinstance(config, ReactionConfig) else ()
+    ranges = dataclasses.asdict(config)
+    ranges.pop("burn_time", None)  # with which the arrival times do not change
+    key = json.dumps([GENERATOR_VERSION, ranges, split, count, *grid, horizon])
+    name = f"fire-{hashlib.sha256(key.encode()).hexdigest()[:32]}.npy"
+    file = cache_folder() / name
     with contextlib.suppress(Exception):  # a damaged header raises many types
-        stored = torch.from_numpy(np.load(file, allow_pickle=False))
-        if stored.dtype == torch.float32 and stored.shape == (count, *times, *grid):
-            return stored
-    fires = make_fires(config, seeds, grid, horizon)
+        return torch.from_numpy(np.load(file, allow_pickle=False))
+    fires = make_fires(config, fire_seeds(split, count, config.test_seed), grid, horizon)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with replaced(file) as partial, partial.open("wb") as handle:

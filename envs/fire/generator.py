@@ -10,10 +10,10 @@ has 30 cells (`BASE_SIDE`); on another grid lengths and rates are scaled by min(
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-from pydantic import Field, ValidationError
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
@@ -26,13 +26,11 @@ from emberlink.envs.fire.ranges import (
     FireRanges,
     Fraction,
     Length,
-    Ordered,
-    Pair,
 )
 from emberlink.envs.fire.reaction import ReactionConfig, reaction_fires
-from emberlink.envs.utils.config_files import find, known, read
+from emberlink.envs.utils.config_files import known, read
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import STRICT, describe
+from emberlink.envs.utils.validation import STRICT, Range, from_plain
 
 Split = Literal["train", "validation", "test"]
 
@@ -60,29 +58,29 @@ class FireConfig(FireRanges):
         *("fuel_patches", "patch_bearing", "patch_distance", "patch_radius", "patch_rate"),
         *("drift_rate", "tide_reach", "tide_period", "tide_phase", "tide_bearing"),
     )
-    head_ros: Annotated[tuple[_Rate, _Rate], Pair, Ordered]
+    head_ros: Range[_Rate]
     """Rate of spread of the head, cells per step."""
-    length_to_breadth: Annotated[tuple[_Ratio, _Ratio], Pair, Ordered]
+    length_to_breadth: Range[_Ratio]
     """Length-to-breadth ratio of the elliptical wavelet, 1 without wind."""
-    fuel_patches: Annotated[tuple[_Count, _Count], Pair, Ordered]
+    fuel_patches: Range[_Count]
     """Number of patches of slow fuel."""
-    patch_bearing: Annotated[tuple[Degrees, Degrees], Pair, Ordered]
+    patch_bearing: Range[Degrees]
     """Direction of a patch from the disc's centre, degrees from the initial azimuth."""
-    patch_distance: Annotated[tuple[_Signed, _Signed], Pair, Ordered]
+    patch_distance: Range[_Signed]
     """Distance of a patch's centre from the initial disc, cells, negative inside."""
-    patch_radius: Annotated[tuple[Length, Length], Pair, Ordered]
+    patch_radius: Range[Length]
     """Distance from a patch's centre at which its effect has fallen to 1/e, cells."""
-    patch_rate: Annotated[tuple[Fraction, Fraction], Pair, Ordered]
+    patch_rate: Range[Fraction]
     """Multiplier of the rate of spread at a patch's centre; 1 is no effect."""
-    drift_rate: Annotated[tuple[_Drift, _Drift], Pair, Ordered] = (0.0, 0.0)
+    drift_rate: Range[_Drift] = (0.0, 0.0)
     """Steady drift of the medium towards the azimuth, cells per step."""
-    tide_reach: Annotated[tuple[_Reach, _Reach], Pair, Ordered] = (0.0, 0.0)
+    tide_reach: Range[_Reach] = (0.0, 0.0)
     """Distance that the tide moves the medium between two turns, cells."""
-    tide_period: Annotated[tuple[_Period, _Period], Pair, Ordered] = (1000.0, 1000.0)
+    tide_period: Range[_Period] = (1000.0, 1000.0)
     """Period of the tide, steps."""
-    tide_phase: Annotated[tuple[Degrees, Degrees], Pair, Ordered] = (0.0, 0.0)
+    tide_phase: Range[Degrees] = (0.0, 0.0)
     """Phase of the tide at step 0, degrees; the speed is greatest at 0."""
-    tide_bearing: Annotated[tuple[Degrees, Degrees], Pair, Ordered] = (0.0, 0.0)
+    tide_bearing: Range[Degrees] = (0.0, 0.0)
     """Direction of the tide at phase 0, degrees counter-clockwise from +x."""
     two_sided: bool = False
     """Whether the back of the wavelet is as fast as its head."""
@@ -111,14 +109,10 @@ def load_scenario(name: str) -> GeneratedConfig:
     Raises:
         UserError: there is no such file, or a value in it is not valid.
     """
-    values = read("fire", name) if name in known("fire") else None
-    if values is None or not _is_generated(values):
-        raise UserError(f"unknown fire {name!r}; known: {', '.join(scenarios())}")
-    config_type = ReactionConfig if "kind" in values else FireConfig
-    try:
-        return config_type(**values)
-    except ValidationError as error:
-        raise UserError(f"{find('fire', name)}: {describe(error)}") from None
+    values = read("fire", name)
+    if not _is_generated(values):
+        raise UserError(f"fire {name!r} is not generated; known: {', '.join(scenarios())}")
+    return from_plain(ReactionConfig if "kind" in values else FireConfig, values, "fire")
 
 
 def fire_seeds(split: Split, count: int, test_seed: int = TEST_FROM) -> Tensor:
@@ -128,10 +122,8 @@ def fire_seeds(split: Split, count: int, test_seed: int = TEST_FROM) -> Tensor:
     2,000,000 to 2,999,999, so the three sets are disjoint. The first test seed is `test_seed`.
 
     Raises:
-        UserError: the split is not known, or the seeds would not lie in its interval.
+        UserError: the seeds would not lie in the interval of the split.
     """
-    if split not in get_args(Split):
-        raise UserError(f"unknown split {split!r}; known: {', '.join(get_args(Split))}")
     first = {"train": 0, "test": test_seed, "validation": VALIDATION_FROM}[split]
     most = TEST_FROM - first % TEST_FROM
     if not 1 <= count <= most:

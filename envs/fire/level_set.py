@@ -102,7 +102,7 @@ def arrival_times(
         [fires, X, Y], steps: 0 where the front is at the start, inf where it does not arrive.
     """
     pad = _PAD + margin
-    x, y = (_nodes(cells, pad, refine, head_ros.device) for cells in grid)
+    x, y = (nodes(cells, pad, refine, head_ros.device) for cells in grid)
     phi = distance(x[None, :, None], y[None, None, :])
     rates = torch.ones(()) if rate_field is None else _refined(rate_field.to(phi), grid, x, y)
     wavelet = ellipse_rates(head_ros.to(phi), length_to_breadth.to(phi), two_sided)
@@ -131,7 +131,7 @@ def arrival_times(
     return arrival.masked_fill(arrival > horizon, math.inf)
 
 
-def _nodes(cells: int, pad: int, refine: int, device: torch.device) -> Tensor:
+def nodes(cells: int, pad: int, refine: int, device: torch.device) -> Tensor:
     """Returns the fine nodes of one axis; every `refine`-th is the centre of a cell."""
     count = (cells - 1 + 2 * pad) * refine + 1
     return torch.arange(count, device=device, dtype=torch.float32) / refine - pad

@@ -3,23 +3,13 @@
 from typing import Annotated, ClassVar
 
 import torch
-from pydantic import AfterValidator, Field, Strict
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from emberlink.envs.utils.counter_rng import Use, fold_in, uniform
-from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import STRICT, Name
+from emberlink.envs.utils.validation import STRICT, Name, Range
 
-
-def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
-    if pair[0] > pair[1]:
-        raise UserError(f"a range is (low, high), got {pair}")
-    return pair
-
-
-Ordered = AfterValidator(_ordered)
-Pair = Strict(False)  # a list, as in YAML, is valid for a tuple
 Degrees = Annotated[float, Field(ge=-360, le=360)]
 Turn = Annotated[float, Field(ge=-3600, le=3600)]
 Length = Annotated[float, Field(gt=0, le=30)]
@@ -39,18 +29,18 @@ class FireRanges:
     """Name of the scenario and its file."""
     num_train_fires: Annotated[int, Field(ge=1, lt=TEST_FROM)]
     """Number of fires to train on."""
-    azimuth: Annotated[tuple[Degrees, Degrees], Pair, Ordered]
+    azimuth: Range[Degrees]
     """Direction in which the head moves at step 0, with the wind, degrees counter-clockwise from
     +x."""
-    wind_shift: Annotated[tuple[Turn, Turn], Pair, Ordered]
+    wind_shift: Range[Turn]
     """Steady turning of that direction, degrees per 1000 steps, counter-clockwise."""
-    centre_x: Annotated[tuple[Fraction, Fraction], Pair, Ordered]
+    centre_x: Range[Fraction]
     """Centre of the initial disc along x, as a fraction of the box (0 to X - 1)."""
-    centre_y: Annotated[tuple[Fraction, Fraction], Pair, Ordered]
+    centre_y: Range[Fraction]
     """Centre of the initial disc along y, as a fraction of the box (0 to Y - 1)."""
-    core_radius: Annotated[tuple[Length, Length], Pair, Ordered]
+    core_radius: Range[Length]
     """Radius of the initial disc, cells."""
-    ring_width: Annotated[tuple[Length, Length], Pair, Ordered]
+    ring_width: Range[Length]
     """Width of the part of the disc that burns at step 0, cells; the rest is burnt out."""
     test_seed: Annotated[int, Field(ge=TEST_FROM, lt=VALIDATION_FROM)] = TEST_FROM
     """Seed of the first test fire."""

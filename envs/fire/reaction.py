@@ -25,9 +25,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from emberlink.envs.config import BASE_SIDE
-from emberlink.envs.fire.ranges import FireRanges, Ordered, Pair
+from emberlink.envs.fire.level_set import nodes
+from emberlink.envs.fire.ranges import FireRanges
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import STRICT
+from emberlink.envs.utils.validation import STRICT, Range
 
 Reaction = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """from temperature rise and fuel to their rates of change"""
@@ -49,6 +50,8 @@ class ReactionConfig(FireRanges):
         *("wind_speed", "azimuth", "wind_shift"),
         *("centre_x", "centre_y", "core_radius", "ring_width"),
     )
+    burn_time: ClassVar[float] = math.inf
+    """Burn-out follows from the equation."""
     kind: Literal["reaction"]
     """Distinguishes it from other scenarios."""
     cell_size: Annotated[float, Field(gt=0, le=1000)]
@@ -73,7 +76,7 @@ class ReactionConfig(FireRanges):
     """Temperature of the ring at step 0, K."""
     residual_fuel: Annotated[float, Field(gt=0, lt=1)]
     """Fraction of the fuel at which a cell is burnt out."""
-    wind_speed: Annotated[tuple[_Wind, _Wind], Pair, Ordered]
+    wind_speed: Range[_Wind]
     """Speed at which the wind carries the heat of the fire, m/s."""
 
     @property
@@ -189,8 +192,8 @@ def reaction_fires(
     cell = config.cell_size * BASE_SIDE / min(grid)
     refine = math.ceil(_NODES_PER_FRONT * cell / config.thickness)
     border = math.ceil(4 * config.thickness / cell)  # cells outside, so that heat can leave
-    nodes = math.prod((side + 2 * border) * refine for side in grid)
-    parts = seeds.split(max(1, _MAX_NODES // nodes))
+    count = math.prod((side + 2 * border) * refine for side in grid)
+    parts = seeds.split(max(1, _MAX_NODES // count))
     return torch.cat([_burn(config, part, grid, horizon, refine, border) for part in parts])
 
 
@@ -240,11 +243,7 @@ def _ring(
     border: int,
 ) -> tuple[Tensor, Tensor]:
     """Returns temperature rise and fuel at step 0: a hot ring whose inside is burnt out."""
-    device = draw["centre_x"].device
-    x, y = (
-        torch.arange((side - 1 + 2 * border) * refine + 1, device=device) / refine - border
-        for side in grid
-    )
+    x, y = (nodes(side, border, refine, draw["centre_x"].device) for side in grid)
     scale = min(grid) / BASE_SIDE
     wide = {name: draw[name][:, None, None] for name in draw}
     along_x = x[:, None] - wide["centre_x"] * (grid[0] - 1)

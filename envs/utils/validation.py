@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Annotated, Any, TypeVar
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, Strict, TypeAdapter, ValidationError
 from pydantic_core import to_json, to_jsonable_python
 
 from emberlink.envs.utils.errors import UserError, shown
@@ -22,6 +22,18 @@ TAG = "kind:"
 
 Name = Annotated[str, Field(pattern=r"^\w[\w.+-]*$", max_length=100)]
 """text that can be part of file names and measures"""
+
+N = TypeVar("N", bound=float)
+
+
+def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] > pair[1]:
+        raise UserError(f"a range is (low, high), got {pair}")
+    return pair
+
+
+Range = Annotated[tuple[N, N], Strict(False), AfterValidator(_ordered)]
+"""(low, high); a list, as in YAML, is valid for the tuple"""
 
 CountOrZero = Annotated[int, Field(ge=0)]
 
