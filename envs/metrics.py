@@ -139,14 +139,12 @@ _PAPER = (
     *(mean_reward, coverage, coverage_auc, time_to_full_coverage, tracking_first, tracking_last),
     *(boundary_exits, fire_losses),
 )
-_MEASURED = front_age, front_age_p95, bytes_per_step
-_OF_BASE = base_coverage, base_coverage_auc, base_age
-_NEEDS = {
+_MEASURED = {
     **{front_age: keys.FRONT_AGE, front_age_p95: keys.FRONT_AGE_P95},
     **{bytes_per_step: keys.BYTES_SENT},
-    **dict.fromkeys(_OF_BASE, keys.BASE_SEEN),
 }
-"""keys that only some worlds have"""
+_OF_BASE = dict.fromkeys((base_coverage, base_coverage_auc, base_age), keys.BASE_SEEN)
+"""measures that only some worlds have, and the key by which an episode shows that it has them"""
 
 NAMES = tuple(measure.__name__ for measure in _PAPER)
 """the measures of every episode, the paper's first"""
@@ -171,7 +169,8 @@ def episode_metrics(steps: TensorDictBase) -> dict[str, Tensor]:
         float32 [...] for each of `NAMES`, and for the measured names of `MEASURED` and `OF_BASE`.
     """
     read: Any = steps
-    more = [measure for measure, key in _NEEDS.items() if read.get(key, None) is not None]
+    some = {**_MEASURED, **_OF_BASE}
+    more = [measure for measure, key in some.items() if read.get(key, None) is not None]
     return {measure.__name__: measure(read) for measure in (*_PAPER, *more)}
 
 

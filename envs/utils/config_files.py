@@ -14,7 +14,7 @@ from typing import Any
 
 from emberlink import configs
 from emberlink.envs.utils.atomic_io import user_path
-from emberlink.envs.utils.errors import UserError, unknown
+from emberlink.envs.utils.errors import UserError, naming, unknown
 
 PACKAGES = "emberlink.configs"
 """group of entry points; each names a package whose folder holds groups"""
@@ -78,13 +78,11 @@ def summary(group: str, name: str) -> str:
 def read(group: str, name: str) -> dict[str, Any]:
     """Returns the content of a configuration file, without the files in its `defaults`."""
     file = find(group, name)
-    try:
+    with naming(file, Exception):  # of the file, YAML or OmegaConf
         values = deepcopy(_content(file, file.stat().st_mtime_ns))
-    except Exception as error:  # of the file, YAML or OmegaConf
-        raise UserError(f"{file}: cannot be read: {' '.join(str(error).split())[:200]}") from None
-    if not isinstance(values, dict):
-        raise UserError(f"{file}: expected keys and values")
-    return values
+        if not isinstance(values, dict):
+            raise UserError("expected keys and values")
+        return values
 
 
 @lru_cache(maxsize=256)
