@@ -80,14 +80,12 @@ def given_points(given: Any, shape: Sequence[int], low: Tensor, high: Tensor) ->
         UserError: they have another shape, or lie outside of the box.
     """
     shapes = [*shape[1:]], [*shape]
-    box = f"{low.tolist()} to {high.tolist()}"
-    expected = f"expected {shapes[0]} or {shapes[1]} inside the box {box}"
     points = torch.as_tensor(given, dtype=torch.float32, device=low.device)
-    if [*points.shape] not in shapes:
-        raise UserError(f"position: shape {list(points.shape)}; {expected}")
-    if not ((points >= low) & (points <= high)).all():
-        span = f"{points.min():g} to {points.max():g}"
-        raise UserError(f"position: values from {span}; {expected}")
+    if [*points.shape] not in shapes or not ((points >= low) & (points <= high)).all():
+        raise UserError(
+            f"position: shape {list(points.shape)}; expected {shapes[0]} or {shapes[1]} inside "
+            f"the box {low.tolist()} to {high.tolist()}"
+        )
     return points.expand(*shape)
 
 

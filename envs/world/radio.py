@@ -12,8 +12,6 @@ PASSING = 15  # steps that a chain needs to pass on all sightings: one link per 
 _NEARER = 0.97  # of the range, so that rounding and small errors of position break no link
 _AT_PLACE = 0.01  # of the range over the ground; distance at which a relay is at its place
 _SILENT = 150  # steps; a UAV not heard of for so long counts as lost where UAVs fail
-
-
 _HALF = 0.65  # of the range: where `fade` loses half of the messages; at the range it loses 90 %
 _STEEP = 5  # 1.7 (path loss exponent 2.79) 10 / (standard deviation of 4.05 dB · ln 10)
 
@@ -57,12 +55,14 @@ class Channel(nn.Module):
             position: float [..., n, 3], of the UAVs, cells.
             rng_key: int64 [...], `keys.RNG_KEY`.
             step: int64 [...], steps since the episode began; [steps, envs] are successive steps.
-            alive: bool [..., n]; see `in_range`. The base never fails.
+            alive: bool [..., n]; a UAV that is not neither hears nor is heard. All are if None.
         """
         config, places = self.config, self.places(position)
+        near = neighbours(places, config.range)
         if alive is not None:
             alive = nn.functional.pad(alive, (0, len(self.base)), value=True)
-        near = hears = in_range(config, places, alive)
+            near &= alive.unsqueeze(-1) & alive.unsqueeze(-2)
+        hears = near
         uses = [(Use.MESSAGE_LOSS, Use.REPORT_LOSS)] * (config.loss > 0)
         uses += [(Use.MESSAGE_FADE, Use.REPORT_FADE)] * config.fade
         units = self._draw(rng_key, step, uses) if uses else []
@@ -164,19 +164,6 @@ def budget(config: RadioConfig, near: Tensor) -> Tensor | None:
         return None
     sharing = 1 + near.sum(-1) if config.shared else near.new_ones(near.shape[:-1]).long()
     return config.bandwidth // sharing
-
-
-def in_range(config: RadioConfig, position: Tensor, alive: Tensor | None = None) -> Tensor:
-    """Returns the links of a step if no message is lost, bool [..., n, n].
-
-    Args:
-        position: float [..., n, 3], cells.
-        alive: bool [..., n]; a radio that is not neither hears nor is heard. All are alive if None.
-    """
-    linked = neighbours(position, config.range)
-    if alive is not None:
-        linked &= alive.unsqueeze(-1) & alive.unsqueeze(-2)
-    return linked
 
 
 def reachable(hears: Tensor) -> Tensor:
