@@ -60,7 +60,6 @@ class WildfireEnv(EnvBase):
     _step_key: Tensor
     _time: Tensor
     _position: Tensor
-    _ahead: Tensor
     _fail_step: Tensor
 
     def __init__(
@@ -117,18 +116,16 @@ class WildfireEnv(EnvBase):
         self.register_buffer("_fail_step", never)
         position = torch.zeros(num_envs, config.num_uavs, 3, dtype=torch.float64)
         self.register_buffer("_position", position)
-        self.register_buffer("_ahead", torch.arange(1, self.hold + 1)[:, None], persistent=False)
 
     def _make_specs(self) -> None:
         """Declares the tensors that the environment reads and writes; see `keys`."""
-        envs, agents = (self.num_envs,), (self.num_envs, self.n_agents)
-        first = self._first_time_step()
+        agents, first = (self.num_envs, self.n_agents), self._first_time_step()
         flags = [*_DONE, *((keys.AGENTS, name) for name in _DONE if self._agent_done)]
         self.observation_spec = make_composite_from_td(first.exclude(*flags))
         self.done_spec = make_composite_from_td(first.select(*flags))
         action = Bounded(-1.0, 1.0, torch.Size((*agents, 3)), dtype=torch.float32)
         uavs = Composite({keys.ACTION[1]: action}, shape=agents)
-        self.action_spec = Composite({keys.AGENTS: uavs}, shape=envs)
+        self.action_spec = Composite({keys.AGENTS: uavs}, shape=agents[:1])
         first.set(keys.REWARD, torch.zeros(*agents, 1, device=self.device))
         earned = first.select(keys.REWARD)
         if self.hold > 1:
@@ -221,9 +218,10 @@ class WildfireEnv(EnvBase):
             return step.update(self._measured())
         chosen, parts = tensordict.select(keys.ACTION), []
         result: Any = None
-        for ahead in self._ahead.split(self.hold if self._steer is None else 1):
+        together = self.hold if self._steer is None else 1
+        for _ in range(self.hold // together):
             steered = chosen if self._steer is None else self._steer(chosen.copy())
-            steps = self._advance(steered.get(keys.ACTION), len(ahead))
+            steps = self._advance(steered.get(keys.ACTION), together)
             parts.append(steps.select(*metrics.counted(self.config)))
             result = steps[-1]
             if self._communicate is not None:
@@ -236,7 +234,7 @@ class WildfireEnv(EnvBase):
 
     def _advance(self, action: Tensor, steps: int) -> TensorDict:
         """Performs steps of the world with the same action; batch size [steps, num_envs]."""
-        time = self._time + self._ahead[:steps]
+        time = self._time + torch.arange(1, steps + 1, device=self.device).unsqueeze(-1)
         alive = self._alive(time)
         moves = [self._move(action, flies) for flies in alive]
         position, hit_boundary = map(torch.stack, zip(*moves, strict=True))
@@ -308,7 +306,9 @@ class WildfireEnv(EnvBase):
             agents[keys.WINDOW[1]] = sighting.classes.unflatten(-1, square)
         if self.config.observation == "map":
             agents[keys.SIGHT[1]] = sighting.shown().unflatten(-1, square)
-        done = self._done(time)
+        truncated = (time >= self.config.horizon).unsqueeze(-1)
+        flags = truncated, torch.zeros_like(truncated), truncated.clone()
+        done = dict(zip(_DONE, flags, strict=True))
         if self._agent_done:
             each = (*position.shape[:-1], 1)
             agents |= {k: v.unsqueeze(-2).expand(each).clone() for k, v in done.items()}
@@ -335,12 +335,6 @@ class WildfireEnv(EnvBase):
             position = motion.scale_to_box(position, self._low, self._high)
             clock = clock / self.config.horizon
         return torch.cat((position, counts[..., :2] > 0, clock), -1)
-
-    def _done(self, time: Tensor) -> dict[str, Tensor]:
-        """Returns the flags at steps [..., num_envs], bool [..., num_envs, 1]."""
-        truncated = (time >= self.config.horizon).unsqueeze(-1)
-        flags = truncated, torch.zeros_like(truncated), truncated.clone()
-        return dict(zip(_DONE, flags, strict=True))
 
     def __repr__(self) -> str:
         config = self.config
