@@ -91,11 +91,9 @@ class WildfireEnv(EnvBase):
         self._make_world(fire)
         torch.nn.Module.to(self, self.device)  # EnvBase.to does nothing for its own device
         self._make_specs()
-        self._seeded = seed is not None
+        self._seeded = False
         if seed is not None:
-            seeds = counter_rng.check_seeds(seed, num_envs)
-            parts = [counter_rng.seed_keys(s, num_envs // len(seeds), self.device) for s in seeds]
-            self._seed_key.copy_(torch.cat(parts))
+            self._set_seed(seed)
 
     def _make_world(self, fire: str | ScenarioConfig | Tensor) -> None:
         """Registers the buffers: constants, and the state of all environments."""
@@ -139,10 +137,12 @@ class WildfireEnv(EnvBase):
         self._seeded = True
         return super().load_state_dict(*args, **kwargs)
 
-    def _set_seed(self, seed: int | None) -> None:
+    def _set_seed(self, seed: int | Sequence[int] | None) -> None:
         seed = secrets.randbelow(2**62) if seed is None else seed
-        (seed,) = counter_rng.check_seeds(seed, 1)
-        self._seed_key.copy_(counter_rng.seed_keys(seed, self.num_envs, self.device))
+        seeds = counter_rng.check_seeds(seed, self.num_envs)
+        each = self.num_envs // len(seeds)
+        parts = [counter_rng.seed_keys(number, each, self.device) for number in seeds]
+        self._seed_key.copy_(torch.cat(parts))
         self._episode.zero_()
         self._seeded = True
 
