@@ -238,7 +238,7 @@ class Measures(nn.Module):
             told.append(new)
             known.append(self.base_seen.clone())
             said += [] if sent is None else [sent[:, :-1]]
-        measured = {keys.BASE_SEEN: torch.stack(known)}
+        measured: dict[Any, Tensor] = {keys.BASE_SEEN: torch.stack(known)}
         if self._world.reports:
             measured[keys.REPORT_BYTES] = torch.stack(said) * alive
         return torch.stack(told) * alive, measured
