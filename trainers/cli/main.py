@@ -1,13 +1,12 @@
 """Runs the command that was typed, and turns errors into one line and an exit status."""
 
-import errno
 import io
 import logging
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from importlib.metadata import version
 
 from emberlink.envs.utils.errors import UserError, one_line, unknown
@@ -16,27 +15,20 @@ from emberlink.trainers.cli.fire import add_fire
 from emberlink.trainers.cli.list import add_list
 from emberlink.trainers.cli.parser import Parser
 
-_ONE_LINE = (
-    *(errno.ENOSPC, errno.EDQUOT, errno.EIO),  # full or broken disks
-    *(errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.EROFS),  # paths of the user
-)
-"""errors of the system that are not defects of the program"""
+_formatwarning, _printed = warnings.formatwarning, set[str]()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command and returns its exit status, which is 2 for a mistake of the user.
 
-    Only defects of the program end in a traceback.
+    Other errors than those of the user and the system end in a traceback.
     """
     if sys.platform == "win32":
         return _report("emberlink", "runs on Linux and macOS; on Windows, use WSL")
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # for characters that the encoding lacks
-    with _one_line_warnings():
-        return _run(list(sys.argv[1:] if arguments is None else arguments))
-
-
-def _run(words: list[str]) -> int:
+    warnings.formatwarning = _on_one_line
+    words = list(sys.argv[1:] if arguments is None else arguments)
     parser, names = _parser()
     if not words:
         parser.print_help()
@@ -57,14 +49,7 @@ def _run(words: list[str]) -> int:
     except UserError as error:
         return _report(program, str(error))
     except OSError as error:
-        if error.errno not in _ONE_LINE:
-            raise
-        return _report(program, f"{error.filename or 'a file'}: {error.strerror}")
-    except RuntimeError as error:
-        # PyTorch has no error class for memory of the CPU.
-        if "DefaultCPUAllocator" in str(error) or type(error).__name__ == "OutOfMemoryError":
-            return _report(program, f"not enough memory: {str(error).splitlines()[0]}")
-        raise
+        return _report(program, f"{error.filename or 'a file'}: {error.strerror or error}")
 
 
 def _report(program: str, message: str, status: int = 2) -> int:
@@ -90,21 +75,11 @@ def _parser() -> tuple[Parser, list[str]]:
     return parser, list(commands.choices)
 
 
-@contextmanager
-def _one_line_warnings() -> Iterator[None]:
-    """Prints each `UserWarning` once as `emberlink: warning: ...`, until the end of the context."""
-    before, printed = warnings.formatwarning, set[str]()
-
-    def formatted(message, category, *place) -> str:
-        if not issubclass(category, UserWarning):
-            return before(message, category, *place)
-        text = one_line(str(message))
-        line = "" if text in printed else f"emberlink: warning: {text}\n"
-        printed.add(text)
-        return line
-
-    warnings.formatwarning = formatted
-    try:
-        yield
-    finally:
-        warnings.formatwarning = before
+def _on_one_line(message, category, *place) -> str:
+    """Formats a `UserWarning` as `emberlink: warning: ...`, or as nothing if it was printed."""
+    if not issubclass(category, UserWarning):
+        return _formatwarning(message, category, *place)
+    text = one_line(str(message))
+    line = "" if text in _printed else f"emberlink: warning: {text}\n"
+    _printed.add(text)
+    return line
