@@ -5,12 +5,9 @@ Their code is imported when they run, so that `emberlink --help` does not import
 
 import argparse
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import fields
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.config_files import find
 from emberlink.trainers.cli.parser import between, command, command_group, path, positive, run_of
 
 if TYPE_CHECKING:
@@ -49,32 +46,21 @@ def add_train(commands: Any) -> None:
 
 
 def _checked(place: str) -> Callable[[argparse.Namespace, "Console"], int]:
-    """Returns a function that checks names and keys, then runs `place` (see `run_of`)."""
+    """Returns a function that runs `place` (see `run_of`).
+
+    It reports a wrong name or key before torch is imported, which takes seconds.
+    """
 
     def run(options: argparse.Namespace, console: "Console") -> int:
-        _check_names(options.method, options.overrides)
+        method, overrides = options.method, options.overrides
+        if not any(text.startswith("resume=") for text in (method, *overrides)):
+            find("method", method)
+            from emberlink.trainers.config.values import composed  # imports Hydra
+
+            composed(method, overrides)
         return run_of(place)(options, console)
 
     return run
-
-
-def _check_names(method: str, overrides: list[str]) -> None:
-    """Reports a wrong name, key or value before torch is imported, which takes seconds."""
-    from emberlink.envs.utils.config_files import find, known
-
-    if any(text.startswith("resume=") for text in (method, *overrides)):
-        return
-    find("method", method)
-    if other := next((text for text in overrides if "=" not in text), None):
-        hint = f"; several methods: emberlink sweep {method} {other}"
-        hint *= other in known("method")
-        raise UserError(f"{other!r} is not of the form key=value{hint}")
-    from emberlink.envs.utils.validation import from_plain  # imports pydantic
-    from emberlink.trainers.config.basics import Basics
-    from emberlink.trainers.config.values import composed  # imports Hydra
-
-    values = composed(method, overrides)
-    from_plain(Basics, {field.name: values[field.name] for field in fields(Basics)})
 
 
 def add_eval(commands: Any) -> None:
@@ -85,7 +71,7 @@ def add_eval(commands: Any) -> None:
     emberlink eval mine.py:act independent setup=tuned --name mine
     """
     usage = "emberlink eval RUN | POLICY METHOD --name NAME [key=value ...]"
-    add = command(commands, "eval", _eval, text, usage=usage)
+    add = command(commands, "eval", "evaluation.evaluate_run:run_command", text, usage=usage)
     run = "a run folder or pretrained:METHOD; or a policy: file.py:NAME, module:NAME or file.onnx"
     add("folder", metavar="RUN | POLICY", type=run_name, help=run)
     add(
@@ -99,30 +85,6 @@ def add_eval(commands: Any) -> None:
     add("--checkpoint", metavar="FILE", type=path, help="a checkpoint (default: the newest)")
     add("--fires", metavar="N", type=positive, help="number of episodes (default: the run's)")
     add("--device", help="cpu, cuda, ... (default: the run's)")
-
-
-def _eval(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.trainers.runs import pretrained
-
-    name, (method, *settings) = options.folder, options.overrides or [""]
-    folder = pretrained.find_one(name) if pretrained.is_name(name) else path(name)
-    if (file := folder / "config.yaml").is_file():
-        _check_changes(file, options.overrides)
-    elif method and "=" not in method:
-        _check_names(method, settings)
-    return run_of("evaluation.evaluate_run:run_command")(options, console)
-
-
-def _check_changes(file: Path, changes: list[str]) -> None:
-    """Reports a wrong key of an evaluation before torch is imported, if the run can be read."""
-    import yaml
-
-    from emberlink.envs.utils.config_files import known
-
-    with suppress(yaml.YAMLError, UnicodeDecodeError, AttributeError):  # the evaluation reports it
-        method = yaml.safe_load(file.read_text()).get("method")
-        if method in known("method"):
-            _check_names(method, changes)
 
 
 def add_export(commands: Any) -> None:
@@ -232,18 +194,10 @@ def add_sweep(commands: Any) -> None:
 
 
 def _sweep(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.envs.utils.config_files import known
-
-    methods = [text for text in options.arguments if "=" not in text]
-    for method in methods or known("method")[:1]:
-        _check_names(method, _first_values(options.arguments))
+    for text in options.arguments:  # before torch is imported
+        if "=" not in text:
+            find("method", text)
     return run_of("sweep.command:sweep")(options, console)
-
-
-def _first_values(arguments: list[str]) -> list[str]:
-    """Returns the keys of a sweep with the first value of each, as far as it needs no parser."""
-    plain = (text for text in arguments if "=" in text and not {*"[({'"} & {*text})
-    return [text.split(",")[0] for text in plain if not text.startswith("executor")]
 
 
 def add_tune(commands: Any) -> None:
@@ -273,19 +227,13 @@ def add_world(commands: Any) -> None:
     conditions of the suite. The exit status is 1 if a world does not satisfy one.
     emberlink world check front fire.burn_time=90 --validation --fires 32
     """
-    add = command(actions, "world check", _world_check, text)
+    add = command(actions, "world check", "worlds.check:check", text)
     names = "worlds (default: those of the suite); keys to change, such as fire.burn_time=90"
     add("arguments", metavar="NAME | key=value", nargs="*", help=names)
     add("--fires", metavar="N", type=positive, default=100, help="number of fires (default: 100)")
     on_validation = {"const": "validation", "default": "test", "action": "store_const"}
     add("--validation", dest="split", help="play on validation fires instead", **on_validation)
     add("--json", dest="output", metavar="FILE", type=path, help="a new file for the numbers")
-
-
-def _world_check(options: argparse.Namespace, console: "Console") -> int:
-    worlds = [f"world={text}" for text in options.arguments if "=" not in text]
-    _check_names("independent", worlds[:1] + [text for text in options.arguments if "=" in text])
-    return run_of("worlds.check:check")(options, console)
 
 
 def add_doctor(commands: Any) -> None:

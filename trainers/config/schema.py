@@ -18,17 +18,18 @@ from pydantic.dataclasses import dataclass
 
 from emberlink.comm.base import MODULES, CommModule
 from emberlink.envs import metrics
+from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.plugins import Plugins
-from emberlink.envs.utils.validation import STRICT, CountOrZero, from_plain, shown
-from emberlink.policies.networks.memory.base import MEMORIES
-from emberlink.policies.networks.messages import MESSAGES
+from emberlink.envs.utils.validation import STRICT, CountOrZero, Name, from_plain, shown
 from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.policies.settings import PolicyConfig
-from emberlink.trainers.config.basics import Basics, Many
-from emberlink.trainers.learners.base import LEARNERS, LearnerConfig
+from emberlink.trainers.learners.base import LEARNERS, Count, LearnerConfig
 
+MAX_FIRES = 65_536
+"""maximum number of held-out fires of an evaluation"""
+Many = Annotated[int, Field(ge=1, le=MAX_FIRES)]
 NOT_LEARNT_WITH = ("device", "logger", "checkpoint_interval", "checkpoint_steps")
 """keys that do not affect learning: configurations that differ only in them are of the same run"""
 
@@ -78,9 +79,37 @@ class EvaluationConfig:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class RunConfig(Basics):
+class RunConfig:
     """All settings of a run."""
 
+    method: Name
+    """name of the method, a file in configs/method"""
+    setup: Name
+    """name of the setup, a file in configs/setup"""
+    world: Name
+    """name of the world, a file in configs/world"""
+    edition: Count = 1
+    """edition of the world: another one has other rules or fires, so numbers do not compare"""
+    replay: Literal["per_agent", "shared"]
+    """whether each UAV has its own replay buffer, or all share one"""
+    env: WildfireConfig
+    """settings of the environment"""
+    policy: PolicyConfig = PolicyConfig()
+    """memory of the policies, and time between their decisions"""
+    episodes: Count
+    """training episodes of each environment"""
+    num_envs: Many
+    """environments, stepped in one batch"""
+    seed: Annotated[int, Field(ge=0, lt=2**31)]
+    """seed of all random numbers"""
+    logger: Literal["wandb", "tensorboard", "csv", "none"]
+    """experiment tracker, in addition to metrics.jsonl"""
+    output: Annotated[str, Field(min_length=1)]
+    """folder in which run folders are created"""
+    checkpoint_interval: Count
+    """episodes between checkpoints"""
+    checkpoint_steps: CountOrZero = 0
+    """steps between additional checkpoints; 0 for none"""
     comm: dict[str, Any]
     """name and settings of the communication module"""
     fire: Scenario
@@ -99,14 +128,6 @@ class RunConfig(Basics):
             where = "is not measured in this world (env.measures, env.base)"
             raise UserError(f"evaluation.headline={headline} {where}; known: {', '.join(known)}")
         return self
-
-    @field_validator("policy")
-    @classmethod
-    def _check_memory(cls, value: PolicyConfig) -> PolicyConfig:
-        MEMORIES.find(value.memory)
-        if value.message != "none":
-            MESSAGES.find(value.message)
-        return value
 
     @field_validator("comm")
     @classmethod

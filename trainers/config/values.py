@@ -3,7 +3,6 @@
 Imports no torch, so that a wrong name or key is reported at once.
 """
 
-import json
 import math
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -79,11 +78,6 @@ def change(
             raise UserError(f"{key}={shown(value)}: choose it with {group}=NAME")
         if key not in known:
             raise UserError(unknown_key(key, known))
-        # The types of learners and communication are known after torch is imported, in seconds.
-        old = reduce(getitem, key.split("."), values)
-        if isinstance(old, int | float) and isinstance(value, str) and "${" not in value:
-            wanted = "true or false" if isinstance(old, bool) else "a number"
-            raise UserError(f"{key}={json.dumps(value)}: should be {wanted}")
         put(values, key, value)
 
 

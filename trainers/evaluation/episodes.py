@@ -13,8 +13,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import is_index, shown
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.base import SCRIPTED
-from emberlink.trainers.config.basics import MAX_FIRES
-from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
 from emberlink.trainers.evaluation.evaluate import (
     BLOCK,
     START_SEED,

@@ -19,9 +19,8 @@ from emberlink.envs.utils.atomic_io import created, free_name, new_file, user_pa
 from emberlink.envs.utils.errors import UserError, shown, unknown
 from emberlink.envs.utils.validation import is_index
 from emberlink.envs.world.coverage_map import split_times
-from emberlink.trainers.config.basics import MAX_FIRES
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
 from emberlink.trainers.fires.plot import arrival_figure
 
 

@@ -10,12 +10,9 @@ import shutil
 from fnmatch import fnmatch
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from emberlink.envs.utils.errors import UserError, naming
-
-if TYPE_CHECKING:  # a wrong name is reported before torch is imported
-    from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.run_folder import RunFolder
 
 PREFIX = "pretrained:"
 _COPY = "pretrained"
@@ -29,23 +26,19 @@ def is_name(text: str) -> bool:
     return text.startswith(PREFIX)
 
 
-def read_run(text: str) -> "RunFolder":
+def read_run(text: str) -> RunFolder:
     """Returns the run of a folder, or of `pretrained:[SETUP/]METHOD[/SEED]`, to be read.
 
     SETUP is such as `tuned` or `study_front`.
     """
-    from emberlink.trainers.runs.run_folder import RunFolder
-
     return RunFolder(find_one(text) if is_name(text) else text)
 
 
-def open_run(text: str) -> "RunFolder":
+def open_run(text: str) -> RunFolder:
     """Returns the run of `read_run`, to be written to.
 
     A trained policy of the package is copied to a run folder in `runs`, unless there is a copy.
     """
-    from emberlink.trainers.runs.run_folder import RunFolder
-
     if not is_name(text):
         return RunFolder(text)
     source = find_one(text)

@@ -13,7 +13,7 @@ NOWHERE = "~nobody_here/x"
 HOME = ["~nobody_here", "home folder"]
 TRAININGS = [
     ("consensu", ["'consensu'", "did you mean consensus?", METHODS]),
-    ("consensus maps", ["'maps'", "emberlink sweep consensus maps"]),
+    ("consensus maps", ["'maps' is not of the form key=value"]),
     ("independent env.failures=2.5", ["env.failures=2.5", "the team has 2 UAVs"]),
     ("independent evaluation.scripted=[orcale]", ["orcale", "did you mean oracle?"]),
     ("consensus learner.buffer_size=5", ["batch_size=8", "buffer_size=5"]),
@@ -28,7 +28,7 @@ COMMANDS = [
     ("sweep executor=slurm", ["executor='slurm' is not known; known: local"]),
     ("world check front evaluation.scripted=[oracle]", ["lacks random_way"]),
     ("train maps env.observation=vector", ["comm.name=maps exchanges the UAVs' maps"]),
-    (f"{IMITATE} learner.teacher=oracle", ["known: courier, map_greedy, shuttle"]),
+    (f"{IMITATE} learner.teacher=oracle", ["as map_greedy does"]),
     (f"train independent output={NOWHERE}", HOME),
     (f"compare {NOWHERE}", HOME),
 ]
@@ -53,10 +53,10 @@ def test_a_mistake_is_one_line_and_leaves_no_files(arguments, words, tmp_path, m
     ("wrong", "seconds"),
     [
         *(("train nosuchmethod", 1), ("sweep nosuchmethod", 1), ("eval nowhere", 1)),
-        *(("train independent x=1", 2), ("train independent learner.tau=fast", 2)),
+        ("train independent x=1", 2),
     ],
 )
-def test_a_wrong_name_or_value_is_answered_without_torch(wrong, seconds):
+def test_a_wrong_name_or_key_is_answered_without_torch(wrong, seconds):
     program = (
         "import sys, time; from emberlink.trainers.cli.main import main\n"
         f"try: status = main({wrong.split()})\nexcept SystemExit as end: status = end.code\n"
