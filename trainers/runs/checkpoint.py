@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from emberlink.envs.utils.atomic_io import open_regular, replaced
+from emberlink.envs.utils.atomic_io import replaced
 from emberlink.envs.utils.errors import UserError, naming
 from emberlink.envs.utils.validation import STRICT, CountOrZero, from_plain, shown
 from emberlink.trainers.config.compose import differences, to_values
@@ -29,10 +29,6 @@ WEIGHTS = "weights/"
 """prefix of the names of the networks' tensors; the others are training state"""
 
 _KEY = "emberlink"
-_MAX_HEADER = 4_000_000
-"""bytes; the header of a checkpoint with 2,000 tensors has a tenth of it"""
-_MAX_FILE = 2**35
-"""bytes; the largest checkpoint measured has 333 MB"""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -75,17 +71,12 @@ def write(path: Path, header: Header, tensors: Mapping[str, Tensor]) -> None:
 
 def read_header(path: Path) -> Header:
     """Returns a checkpoint's header."""
-    with naming(path):
-        with open_regular(path, _MAX_FILE) as file:
-            length = int.from_bytes(file.read(8), "little")
-            head = file.read(length) if length <= _MAX_HEADER else b""
-        try:
-            values = json.loads(json.loads(head)["__metadata__"][_KEY])
-            written = values.pop("format")
-        except (KeyError, TypeError, ValueError, AttributeError, RecursionError):
-            raise UserError("not a checkpoint: damaged, or of another program") from None
-        if written != FORMAT:
-            raise UserError(f"of format {shown(written)}; this version reads {FORMAT}")
+    with naming(path, SafetensorError):
+        with safe_open(path, "pt") as file:
+            about = file.metadata() or {}
+        values = json.loads(about.get(_KEY, "{}"))
+        if not isinstance(values, dict) or values.pop("format", None) != FORMAT:
+            raise UserError(f"not a checkpoint of format {FORMAT}, which this version reads")
         return from_plain(Header, values)
 
 
