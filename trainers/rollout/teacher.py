@@ -10,7 +10,7 @@ from torchrl.envs import Transform
 
 from emberlink.comm._belief import BeliefMaps
 from emberlink.envs import keys
-from emberlink.envs.utils.errors import UserError, unknown
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.policies.scripted.map_greedy import MapGreedy
@@ -121,13 +121,12 @@ def find(name: str) -> type[MapGreedy]:
     """Returns the scripted policy of a name, which plans by the maps that UAVs share in range.
 
     Raises:
-        UserError: no teacher has this name; the message lists the known ones.
+        UserError: no scripted policy has this name, or it plans otherwise.
     """
-    known = {
-        other: policy
-        for other, policy in ((other, SCRIPTED.find(other)) for other in SCRIPTED.known())
-        if issubclass(policy, MapGreedy) and policy.hears
-    }
-    if name not in known:
-        raise UserError(f"learner.teacher={unknown(name, known)}")
-    return known[name]
+    policy = SCRIPTED.find(name, "learner.teacher")
+    if not issubclass(policy, MapGreedy) or not policy.hears:
+        raise UserError(
+            f"learner.teacher={name}: does not plan by the maps that UAVs share in range, as "
+            "map_greedy does"
+        )
+    return policy
