@@ -1,6 +1,5 @@
 """Stores the UAVs' transitions, per UAV or shared by all (paper, sections IV.C and IV.D)."""
 
-import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -45,19 +44,13 @@ class TeamReplay:
     ):
         uavs, shared, self.device = context.num_uavs, context.shared_replay, context.device
         rows = -(-buffer_size // uavs) if shared else buffer_size
-        # The run cannot fill more rows; the last one of an episode may be padded.
-        episodes, rest = divmod(context.total_steps, context.horizon)
-        most = episodes * -(-context.horizon // decisions) + -(-rest // decisions)
-        self.capacity = min(rows, most * context.num_envs)
+        self.capacity = min(rows, context.total_steps * context.num_envs)  # a run fills no more
         self.needed = -(-batch_size // uavs) if shared else batch_size
         """rows that hold a full batch"""
-        first = -(-self.needed // context.num_envs) * decisions
-        fits = self.needed <= self.capacity
-        self.learning_starts = first if fits else context.total_steps + 1
+        self.learning_starts = -(-self.needed // context.num_envs) * decisions
         """decisions of the batch of environments before the first batch"""
         self.written = 0
         """rows written so far, including overwritten ones"""
-        logging.getLogger("torchrl").addFilter(_tells_no_storage)
         self._buffer = ReplayBuffer(
             storage=LazyTensorStorage(self.capacity, device=context.device),
             sampler=UavSampler(uavs, generator, shared=shared and mixed, joint=joint),
@@ -129,10 +122,6 @@ class UavSampler(RandomSampler):
         size = count, 1 if self.joint else len(self.own)
         drawn = torch.randint(limit, size, generator=self.generator, device=self.own.device)
         return drawn.expand(-1, len(self.own))
-
-
-def _tells_no_storage(record: logging.LogRecord) -> bool:
-    return "Initialized LazyTensorStorage" not in str(record.msg)  # at each training's first row
 
 
 def to_rows(rollout: TensorDictBase, context: LearnerContext) -> TensorDict:
