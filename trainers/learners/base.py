@@ -55,11 +55,6 @@ class LearnerConfig:
     """whether all UAVs use the same weights; if not, each UAV has its own"""
 
     @property
-    def replays(self) -> bool:
-        """Whether the learner has a replay buffer, which the UAVs may share."""
-        return True
-
-    @property
     def reads_map(self) -> bool:
         """Whether the learner reads the true map of the fire, `keys.TRUE_MAP`, in training."""
         return False

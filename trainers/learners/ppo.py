@@ -86,10 +86,6 @@ class IPPOConfig(LearnerConfig):
     warm_start: str = ""
     """run folder, or `pretrained:…`, whose actors the run begins with; none if empty"""
 
-    @property
-    def replays(self) -> bool:
-        return False
-
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class MAPPOConfig(IPPOConfig):

@@ -89,15 +89,10 @@ def _notes(trainer: Trainer) -> Iterator[str]:
     if trainer.changed_versions:
         made = f"the checkpoint was made with {trainer.changed_versions}"
         yield f"{made}: the numbers may not be those of a run that was never stopped"
-    config, learner = trainer.config, trainer.config.learner
+    config = trainer.config
     starts = trainer.setup.learner.learning_starts * config.policy.hold
     if starts > trainer.setup.total_steps:
         yield "a first batch needs more transitions than this run collects: nothing will be learnt"
-    if config.replay == "shared" and config.comm["name"] == "no_comm" and not learner.replays:
-        yield (
-            f"learner={learner.name} has no replay buffer to share: {config.method} trains as "
-            "independent does"
-        )
     if trainer.setup.step:
         return  # the files of the setup may have gone since
     chosen = f"setup={config.setup}", f"world={config.world}", "fire=paper"  # which needs no file
