@@ -129,7 +129,7 @@ def _do(verb: str, line: Sequence[str]) -> bool:
     sys.stdout.flush()
     if verb != "run":
         return False
-    program = [sys.executable, "-m", "emberlink.trainers.cli"]
+    program = [sys.executable, "-m", "emberlink"]
     return subprocess.run([*program, *line], check=False).returncode != 0
 
 

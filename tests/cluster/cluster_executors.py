@@ -19,7 +19,7 @@ from emberlink.trainers.runs.run_folder import RunFolder
 
 pytestmark = pytest.mark.cluster
 COMMAND = [
-    *(sys.executable, "-m", "emberlink.trainers.cli", "sweep", "consensus", "seed=0,1,2"),
+    *(sys.executable, "-m", "emberlink", "sweep", "consensus", "seed=0,1,2"),
     *("output=runs", "episodes=40", "env.horizon=15", "env.num_uavs=2", "num_envs=2"),
     *("learner.hidden=[8,8]", "learner.batch_size=8", "checkpoint_steps=30"),
     *("evaluation.episodes=2", "evaluation.interval=0", "evaluation.scripted=[]"),
@@ -81,7 +81,7 @@ def wait_for(condition: Callable[[], object], process: subprocess.Popen) -> None
 def results(folder: Path) -> dict[str, bytes]:
     """Returns the files that must not depend on where and how often a run was started."""
     files = [run.path / name for run in runs_in(folder) for name in ("metrics.jsonl", "eval.json")]
-    files += [run.checkpoint() for run in runs_in(folder)]
+    files += [run.newest for run in runs_in(folder)]
     return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 
 

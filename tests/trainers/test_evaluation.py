@@ -16,7 +16,7 @@ from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation import evaluate, scores
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.terminal.console import SafeConsole
+from emberlink.trainers.terminal.console import PlainConsole
 
 SMALL = ["env.horizon=12", "env.num_uavs=2", "learner.hidden=[8,8]", "env.grid=[12,10]"]
 
@@ -106,7 +106,7 @@ def test_eval_json_describes_the_evaluation(run, cache):
     content = json.loads((run / "eval.json").read_text())
     config = RunFolder(run).config()
     assert content["method"] == "consensus"
-    assert content["checkpoint"] == RunFolder(run).checkpoint().name
+    assert content["checkpoint"] == RunFolder(run).newest.name
     assert content["fires"] == 3
     assert content["environment"]["horizon"] == config.env.horizon
     assert content["versions"].keys() >= {"emberlink", "torch", "python"}
@@ -153,7 +153,7 @@ def test_narrow_tables_keep_every_number(columns, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", columns)
     measured = {name: [1000.5 + place] * 2 for place, name in enumerate(metrics.NAMES)}
     results = {"huygens": dict.fromkeys(("learned", *POLICIES), measured)}
-    scores.print_results(SafeConsole(), results, resolve("shared_memory", ["setup=released"]))
+    scores.print_results(PlainConsole(), results, resolve("shared_memory", ["setup=released"]))
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= int(columns)
     words = " ".join(lines).split()
@@ -167,7 +167,7 @@ def test_words_make_room_for_numbers(monkeypatch, capsys):
     table.add_row("time_to_coverage of", "random waypoints", "[1000.0, 1000.0]")
     for columns in range(48, 70):
         monkeypatch.setenv("COLUMNS", str(columns))
-        SafeConsole().print(table)
+        PlainConsole().print(table)
         lines = capsys.readouterr().out.splitlines()
         assert max(map(len, lines)) <= columns
         assert "[1000.0, 1000.0]" in " ".join(lines)

@@ -66,7 +66,7 @@ def test_load_gives_the_trained_policy_and_its_environment(trained):
     assert isinstance(policy, TensorDictModule)
     assert policy.in_keys == [keys.OBSERVATION]
     assert policy.out_keys == [keys.ACTION]
-    assert policy.checkpoint == RunFolder(trained.path).checkpoint()
+    assert policy.checkpoint == RunFolder(trained.path).newest
     assert not any(weight.requires_grad for weight in policy.parameters())
     env = trainers.make_env(policy.config, num_envs=3, seed=1)
     rollout = env.rollout(5, policy)

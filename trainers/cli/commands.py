@@ -53,7 +53,7 @@ def _checked(place: str) -> Callable[[argparse.Namespace, "Console"], int]:
 
     def run(options: argparse.Namespace, console: "Console") -> int:
         method, overrides = options.method, options.overrides
-        if not any(text.startswith("resume=") for text in (method, *overrides)):
+        if not method.startswith("resume="):
             find("method", method)
             from emberlink.trainers.config.values import composed  # imports Hydra
 

@@ -41,9 +41,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # of a cache in no home folder
     try:
-        from emberlink.trainers.terminal.console import SafeConsole
+        from emberlink.trainers.terminal.console import PlainConsole
 
-        return options.run(options, SafeConsole())
+        return options.run(options, PlainConsole())
     except KeyboardInterrupt:
         return _report(program, "stopped", 130)
     except UserError as error:

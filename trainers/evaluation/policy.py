@@ -164,7 +164,7 @@ def load_policy(
     if runs and not (folder / "config.yaml").exists():
         raise UserError(f"{folder}: a folder of {len(runs)} runs; choose one: {', '.join(runs)}")
     name = foreign_name(run)
-    file = run.checkpoint() if checkpoint is None and not name else checkpoint
+    file = run.newest if checkpoint is None and not name else checkpoint
     trained = run.config(file, **({} if device is None else {"device": device}))
     given = {**dict(parse(text) for text in overrides), **(settings or {})}
     config = evaluated_with(trained, given)

@@ -44,12 +44,11 @@ class RunFolder:
     def __init__(self, path: Path | str):
         self.path = atomic_io.user_path(path)
         for place, folders, files in os.walk(self.path):
-            # wandb makes links in its folder; the tracker removes them before wandb writes there.
-            of_wandb = (self.path / "wandb") in (Path(place), *Path(place).parents)
-            for name in (*folders, *files):
-                entry = Path(place, name)
+            for entry in (Path(place, name) for name in (*folders, *files)):
+                # wandb makes links in its folder; the tracker removes them before wandb writes.
+                of_wandb = entry.is_symlink() and self.path / "wandb" in entry.parents
                 with suppress(FileNotFoundError):  # a training has just removed it
-                    if not _is_ordinary(entry) and not (of_wandb and entry.is_symlink()):
+                    if not (of_wandb or _is_ordinary(entry)):
                         raise UserError(
                             f"{entry}: a link, a pipe or a device; a run folder holds only folders "
                             "and files"
@@ -106,12 +105,6 @@ class RunFolder:
         """The path of the newest checkpoint, which may not exist yet."""
         return self.path / NEWEST
 
-    def checkpoint(self) -> Path:
-        """Returns the path of the newest checkpoint."""
-        if not self.newest.is_file():
-            raise UserError(f"{self.path}: holds no {NEWEST}")
-        return self.newest
-
     def metrics(self) -> list[dict[str, Any]]:
         """Returns the lines of metrics.jsonl; an empty list if there is no such file.
 
@@ -153,7 +146,7 @@ class RunFolder:
 
     def step(self) -> int:
         """Returns the step of the newest checkpoint."""
-        return checkpoint.read_header(self.checkpoint()).step
+        return checkpoint.read_header(self.newest).step
 
     def write(self, file: str, content: Mapping[str, Any]) -> None:
         """Writes a JSON file completely, or leaves the earlier one."""

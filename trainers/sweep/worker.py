@@ -29,4 +29,4 @@ if __name__ == "__main__":
         Lock(Path(sys.argv[1]), patience=60).release()  # an earlier process may save and end
     sys.argv[1:2] = ["train", f"resume={sys.argv[1]}"]
     # By name, since importing the command line here would be circular.
-    runpy.run_module("emberlink.trainers.cli", run_name="__main__", alter_sys=True)
+    runpy.run_module("emberlink", run_name="__main__", alter_sys=True)

@@ -1,15 +1,12 @@
 """Defines the console of the command line and the style of its tables."""
 
 import os
-from collections.abc import Iterator
 from copy import copy
 from functools import partial
 from typing import Any
-from unicodedata import category
 
 from rich import box
-from rich.console import Console, ConsoleOptions, RenderableType
-from rich.segment import Segment
+from rich.console import Console
 from rich.table import Table
 
 plain_table = partial(
@@ -24,11 +21,10 @@ plain_table = partial(
 """Returns a table without a frame."""
 
 
-class SafeConsole(Console):
+class PlainConsole(Console):
     """A console on standard output, without markup; lines of pipes are as long as the text.
 
-    Control characters in names, such as escape sequences, are replaced. A table that is too wide is
-    printed in parts, with the first column and some of the others.
+    A table that is too wide is printed in parts, with the first column and some of the others.
     """
 
     def __init__(self) -> None:
@@ -68,17 +64,3 @@ class SafeConsole(Console):
                 if self.measure(part, options=wide).maximum > self.width and not column.no_wrap:
                     column.max_width = column.min_width
         return parts
-
-    def render(
-        self, renderable: RenderableType, options: ConsoleOptions | None = None
-    ) -> Iterator[Segment]:
-        """Renders as rich does, with control characters in the text replaced."""
-        for text, style, control in super().render(renderable, options):
-            shown = text if control or text.isprintable() else "".join(map(_harmless, text))
-            yield Segment(shown, style, control)
-
-
-def _harmless(character: str) -> str:
-    """Returns a character, or ? for one that controls the terminal or the direction of text."""
-    controls = category(character) in ("Cc", "Cf") and character not in "\t\n"
-    return "?" if controls else character

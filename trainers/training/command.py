@@ -22,7 +22,11 @@ def train(method: str, overrides: Sequence[str], console: Console) -> int:
     SIGINT, SIGTERM and SIGHUP end the training after the current step with a checkpoint; the exit
     status is then 128 plus the number of the signal. `method` may be `resume=RUN`.
     """
-    trainer = _trainer(method, overrides)
+    if method.startswith("resume="):
+        trainer = resume(method.removeprefix("resume="), overrides)
+    else:
+        trainer = Trainer(resolve(method, overrides))
+        trainer.start()
     interruption = Interruption(trainer.stop)
     try:
         _announce(trainer, console)
@@ -50,21 +54,6 @@ def train(method: str, overrides: Sequence[str], console: Console) -> int:
     finally:
         trainer.close()
     return 0
-
-
-def _trainer(method: str, overrides: Sequence[str]) -> Trainer:
-    """Returns a new training, or the resumed training of `resume=RUN`."""
-    words = [method, *overrides]
-    folders = [word.partition("=")[2] for word in words if word.startswith("resume=")]
-    if not folders:
-        trainer = Trainer(resolve(method, overrides))
-        trainer.start()
-        return trainer
-    if len(folders) > 1 or not folders[0]:
-        raise UserError("resume=RUN: expected one run folder")
-    others = [word for word in words if not word.startswith("resume=")]
-    named = others.pop(0) if others and "=" not in others[0] else None
-    return resume(folders[0], named, others)
 
 
 def _announce(trainer: Trainer, console: Console) -> None:

@@ -17,18 +17,14 @@ MAY_CHANGE = ("episodes", *NOT_LEARNT_WITH)
 """keys that may be changed when a run is resumed, besides the keys of `evaluation`"""
 
 
-def resume(
-    path: Path | str, method: str | None = None, overrides: Sequence[str] = (), **settings: Any
-) -> Trainer:
+def resume(path: Path | str, overrides: Sequence[str] = (), **settings: Any) -> Trainer:
     """Returns the training of a run folder, restored from its newest checkpoint.
 
     Metrics of later episodes and incomplete files are removed. A run without a checkpoint begins
-    again. `method` must be the run's; the other arguments change keys of `MAY_CHANGE`.
+    again. The other arguments change keys of `MAY_CHANGE`.
     """
     run = RunFolder(path)
     before = run.config()
-    if method is not None and method != before.method:
-        raise UserError(f"method {method!r}: the run is of method {before.method!r}")
     config = override(before, overrides, **settings)
     for key, (new, old) in differences(config, before).items():
         if key not in MAY_CHANGE and not key.startswith("evaluation."):

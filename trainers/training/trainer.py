@@ -138,7 +138,7 @@ class Trainer:
             report: called with the names of the fire and the policy before each evaluation.
         """
         config, run = self.config, self.run
-        policy = TrainedPolicy(self.setup.actor, config, run.checkpoint())
+        policy = TrainedPolicy(self.setup.actor, config, run.newest)
         results = evaluate_run(run, policy, report=report)
         pictures = [p for p in sorted(run.figures().iterdir()) if p.suffix in (".png", ".gif")]
         self.tracker.log_evaluation(learned_means(results), pictures)

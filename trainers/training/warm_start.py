@@ -24,7 +24,7 @@ def start(learner: Learner, config: RunConfig) -> None:
     try:
         run = read_run(name)
         theirs = run.config()
-        weights = load_weights(run.checkpoint(), learner.actor.module, config)
+        weights = load_weights(run.newest, learner.actor.module, config)
     except UserError as error:
         said = str(error).removeprefix(f"{name}: ")
         raise UserError(f"learner.warm_start={name}: {said}") from None

@@ -34,7 +34,7 @@ def test_train_writes_its_files_and_prints_the_table(tmp_path, capsys):
 def test_eval_uses_the_given_checkpoint(run, capsys):
     newest = (run / "eval.json").read_bytes()
     trained = json.loads(newest)["results"]["huygens"]
-    file = RunFolder(run).checkpoint()
+    file = RunFolder(run).newest
     header, weights = checkpoint.read_header(file), checkpoint.read_tensors(file)
     moved = "/actor_network_params.module.action.bias"
     changed = {name: value + 9 * name.endswith(moved) for name, value in weights.items()}

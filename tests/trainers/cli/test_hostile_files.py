@@ -72,7 +72,7 @@ CHECKPOINTS = {
 
 @pytest.mark.parametrize("kind", CHECKPOINTS)
 def test_a_checkpoint(kind, run, mark, capsys):
-    RunFolder(run).checkpoint().write_bytes(CHECKPOINTS[kind](mark))
+    RunFolder(run).newest.write_bytes(CHECKPOINTS[kind](mark))
     for command in (["eval", run], ["train", f"resume={run}"]):
         assert "checkpoint.safetensors" in harmless(command, capsys, mark)
 

@@ -121,6 +121,6 @@ def test_errors_of_render(tmp_path, capsys):
     for arguments, words in cases:
         refused(["render", *arguments], capsys, *words)
     RunFolder(run).newest.unlink()
-    refused(["render", run], capsys, "holds no checkpoint")
+    refused(["render", run], capsys, "checkpoint.safetensors")
     assert there.read_text() == "mine"
     assert not [*tmp_path.rglob("*.mp4"), *tmp_path.rglob("*.png")]

@@ -84,7 +84,7 @@ def test_packed_runs_omit_the_training_state(packed):
         assert str(run.parent) not in (mine / "config.yaml").read_text()
         config = RunFolder(run).config()
         trained_actor, packed_actor = (
-            load_actor(config, RunFolder(path).checkpoint()) for path in (run, mine)
+            load_actor(config, RunFolder(path).newest) for path in (run, mine)
         )
         for name, weight in trained_actor.state_dict().items():
             assert weight.equal(packed_actor.state_dict()[name])
@@ -140,7 +140,7 @@ def test_every_shipped_policy_loads():
         run = RunFolder(folder)
         config = run.config()
         assert folder.name == f"s{config.seed}"
-        actor = load_actor(config, run.checkpoint())
+        actor = load_actor(config, run.newest)
         assert all(torch.isfinite(weight).all() for weight in actor.parameters())
         assert len(run.metrics()) == config.episodes
         evaluation = json.loads((folder / "eval.json").read_text())

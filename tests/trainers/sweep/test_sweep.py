@@ -239,7 +239,7 @@ def test_a_killed_sweep_ends_its_trainings(tmp_path):
     (tmp_path / "random.py").write_text("raise RuntimeError('modules here are not imported')\n")
     command = [
         sys.executable,
-        *["-P", "-m", "emberlink.trainers.cli", "sweep", "independent"],
+        *["-P", "-m", "emberlink", "sweep", "independent"],
         *TRAINED,
     ]
     process = subprocess.Popen([*command, "episodes=9999", "output=runs"], cwd=tmp_path)

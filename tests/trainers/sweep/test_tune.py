@@ -7,7 +7,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep.tune import tune
-from emberlink.trainers.terminal.console import SafeConsole
+from emberlink.trainers.terminal.console import PlainConsole
 from emberlink.trainers.training.trainer import Trainer
 
 TINY = [
@@ -66,7 +66,7 @@ def test_a_trial_below_the_median_is_stopped(tmp_path, space, monkeypatch):
     coverage = iter([*[50.0] * 15, 10.0, 10.0, 10.0])
     validate = "emberlink.trainers.evaluation.evaluate.validate"
     monkeypatch.setattr(validate, lambda *_: {"huygens/coverage": next(coverage)})
-    tune("independent", [*TINY, f"output={tmp_path}"], SafeConsole(), space=space, trials=6)
+    tune("independent", [*TINY, f"output={tmp_path}"], PlainConsole(), space=space, trials=6)
     *whole, poor = [len(RunFolder(file.parent).metrics()) for file in runs(tmp_path)]
     assert whole == [3] * 5
     assert poor == 1
@@ -84,5 +84,5 @@ def test_a_mistake_is_named(tmp_path, settings, text, message):
     file.write_text(text)
     words = [*TINY, *settings, f"output={tmp_path}"]
     with pytest.raises(UserError, match=message):
-        tune("independent", words, SafeConsole(), space=file, trials=1)
+        tune("independent", words, PlainConsole(), space=file, trials=1)
     assert [*tmp_path.iterdir()] == [file]

@@ -102,7 +102,7 @@ def check_lines(run: RunFolder, config) -> None:
 def check_actor(run: RunFolder, config, trainer: Trainer) -> None:
     """Checks that the checkpoint's actor equals the trained actor."""
     assert run.step() == EPISODES * HORIZON
-    loaded = load_actor(config, run.checkpoint())
+    loaded = load_actor(config, run.newest)
     rollout = trainer.setup.env.rollout(5, trainer.setup.learner.actor)
     for step in range(5):
         observed = keys.observation_keys(trainer.setup.env.observation_spec)

@@ -215,9 +215,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_the_command_resumes_and_reports_a_finished_run(paused, whole, capsys):
-    refused(["train", "positional", f"resume={paused}"], capsys, "is of method 'consensus'")
     (paused / "config.yaml").write_text("learner: edited\n")  # the checkpoint holds the settings
-    assert main.main(["train", "consensus", f"resume={paused}", "evaluation.episodes=2"]) == 0
+    assert main.main(["train", f"resume={paused}", "evaluation.episodes=2"]) == 0
     assert "resumed at step 15 of 40" in capsys.readouterr().out
     uninterrupted = (whole("consensus", *REPLAY).run.path / METRICS).read_bytes()
     assert (paused / METRICS).read_bytes() == uninterrupted

@@ -1,7 +1,6 @@
 """Runs trainings as tasks of a Ray cluster."""
 
 import os
-import signal
 import time
 from collections.abc import Sequence
 from importlib import import_module
@@ -14,7 +13,6 @@ from emberlink.envs.utils.errors import UserError, require
 from emberlink.envs.utils.validation import STRICT, CountOrZero
 from emberlink.trainers.sweep.executors.base import DIED, Executor, Positive, Task
 
-_STOPPED = 128 + signal.SIGTERM
 Part = Annotated[float, Field(ge=0, strict=False, allow_inf_nan=False)]
 
 
@@ -46,9 +44,7 @@ def _train(task: Task, threads: int) -> int:
             time.sleep(0.2)  # Ray does not interrupt a call that waits for a process
     except KeyboardInterrupt:  # of ray.cancel
         process.terminate()
-        process.wait()
-        return _STOPPED
-    return process.returncode
+    return process.wait()
 
 
 class RayExecutor(Executor):
@@ -90,8 +86,6 @@ class RayExecutor(Executor):
             return None
         try:
             return ray.get(handle)
-        except ray.exceptions.TaskCancelledError:
-            return _STOPPED
         except ray.exceptions.RayError:
             return DIED
 
