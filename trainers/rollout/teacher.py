@@ -59,8 +59,8 @@ class Teacher(Transform):
     It is added after the communication. Each UAV's action depends on its own map and on the targets
     of the UAVs that it hears (see `KnownMaps`). The environment does not change. An action flies
     towards the target at full speed, or reaches it at the end of the steps for which it is held.
-    With held actions, targets are chosen at each decision, else as often as the policy chooses
-    them.
+    With held actions, which the environment holds, targets are chosen at each decision, else as
+    often as the policy chooses them.
 
     Args:
         env: the environment without transforms.
@@ -85,7 +85,6 @@ class Teacher(Transform):
         policy = find(name)(env, KnownMaps(maps))
         policy.stride *= hold
         policy.period = hold if hold > 1 else policy.period
-        self._hold = hold
         self._policy = (policy,)  # not registered: it has no state but the targets
         target = torch.zeros(env.num_envs, env.n_agents, 2, dtype=torch.float32)
         self.register_buffer("target", target)
@@ -101,13 +100,12 @@ class Teacher(Transform):
     def _teach(self, tensordict: TensorDictBase, began: Tensor | None) -> TensorDictBase:
         """Writes the actions; the targets change where episodes began, everywhere if None."""
         (policy,) = self._policy
-        decides = tensordict.get(keys.STEP) % self._hold == 0
-        if not decides.any():  # nobody acts
-            return tensordict.set(keys.TEACHER, torch.zeros_like(tensordict.get(keys.POSITION)))
         given: Any = tensordict.select(*policy.in_keys, keys.HEARS, strict=False)
         acted = policy(given.set(policy.TARGET, self.target.clone()))
-        mask = decides if began is None else began.flatten() & decides
-        self.target.copy_(torch.where(mask.view(-1, 1, 1), acted.get(policy.TARGET), self.target))
+        target = acted.get(policy.TARGET)
+        if began is not None:
+            target = torch.where(began.view(-1, 1, 1), target, self.target)
+        self.target.copy_(target)
         return tensordict.set(keys.TEACHER, acted.get(keys.ACTION))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

@@ -158,7 +158,7 @@ class Trainer:
             raise self._non_finite(name)
         self.run.sync_metrics()
         about = checkpoint.header_of(self.config, self.setup.step, best=self.best, resumable=True)
-        checkpoint.write(self.run.newest, about, state | self._weights())
+        checkpoint.write(self.run.newest, about, state)
         self.saved = self.setup.step
 
     def restore(self) -> None:
