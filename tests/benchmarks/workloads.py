@@ -124,5 +124,5 @@ def matrix_product(device: str = "cpu") -> Callable[[], object]:
 def batch_of(setup: TrainingSetup) -> TensorDict:
     """Returns a sample of a replay buffer with a few hundred steps."""
     learner: Any = setup.learner
-    setup.dry_run(learner.learning_starts + 20)
+    setup.dry_run(-(-learner.replay.needed // setup.config.num_envs) + 20)
     return to_batch(learner.replay.sample())

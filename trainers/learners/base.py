@@ -129,8 +129,6 @@ class Learner(ABC):
     """the replay buffer, if there is one; its state is saved"""
     rollout_steps: int = 1
     """decisions of the batch of environments per call of `learn`; must divide the horizon"""
-    learning_starts: int = 0
-    """decisions of the batch of environments before the first update"""
     recent: Any = ()
     """time steps that no update has used yet, batch size [environments, steps] each"""
     decisions: int = 0

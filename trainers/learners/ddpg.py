@@ -117,7 +117,6 @@ class DDPG(Learner):
             # A shared network learns from all UAVs anyway, and its input is the index of a column.
             mixed=not (config.share_parameters and policy.agent_index),
         )
-        self.learning_starts = self.replay.learning_starts
 
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
         """Stores a rollout, and performs updates if there is a full batch."""

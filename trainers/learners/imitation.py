@@ -99,9 +99,7 @@ class Imitation(Learner):
             joint=speaks,  # the messages of a team at one time
             # With `agent_index`, the input is the index of a column.
             mixed=not speaks and not context.policy.agent_index,
-            decisions=self.sequence,
         )
-        self.learning_starts = self.replay.learning_starts
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.lr, fused=True)
         self.recent = []  # decisions that do not fill a row yet
         self._schedule()

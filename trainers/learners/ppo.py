@@ -148,7 +148,6 @@ class PPO(Learner, ABC):
         self.parts = [list(part.module.parameters()) for part in (self.actor, self.critic)]
         weights = [*self.parts[0], *self.parts[1]]
         self.optimizer = torch.optim.Adam(weights, lr=config.lr, eps=1e-5, fused=True)
-        self.learning_starts = context.horizon
         # Several decisions at once cost less; a whole episode would fill the memory twice.
         self.rollout_steps = max(n for n in range(1, 11) if context.horizon % n == 0)
         self.recent = []  # transitions of the current episode

@@ -28,7 +28,6 @@ class TeamReplay:
             together.
         joint: whether the UAVs draw the same rows, see `UavSampler`.
         mixed: whether a UAV also draws the entries of others, if the buffer is shared.
-        decisions: decisions of an entry.
     """
 
     def __init__(
@@ -40,15 +39,12 @@ class TeamReplay:
         buffer_size: int,
         joint: bool = False,
         mixed: bool = True,
-        decisions: int = 1,
     ):
         uavs, shared, self.device = context.num_uavs, context.shared_replay, context.device
         rows = -(-buffer_size // uavs) if shared else buffer_size
         self.capacity = min(rows, context.total_steps * context.num_envs)  # a run fills no more
         self.needed = -(-batch_size // uavs) if shared else batch_size
         """rows that hold a full batch"""
-        self.learning_starts = -(-self.needed // context.num_envs) * decisions
-        """decisions of the batch of environments before the first batch"""
         self.written = 0
         """rows written so far, including overwritten ones"""
         self._buffer = ReplayBuffer(

@@ -39,6 +39,9 @@ def train(method: str, overrides: Sequence[str], console: Console) -> int:
             interruption.at_once = True
             if interruption.received:
                 raise Interrupted
+            if not setup.learner.updates:
+                text = "note: nothing was learnt: a batch needs more transitions than there were"
+                console.print(text, style="yellow", soft_wrap=True)
             if not trainer.run.evaluated():
                 results = trainer.evaluate(reporter(console))
                 print_results(console, results, trainer.config)
@@ -79,9 +82,6 @@ def _notes(trainer: Trainer) -> Iterator[str]:
         made = f"the checkpoint was made with {trainer.changed_versions}"
         yield f"{made}: the numbers may not be those of a run that was never stopped"
     config = trainer.config
-    starts = trainer.setup.learner.learning_starts * config.policy.hold
-    if starts > trainer.setup.total_steps:
-        yield "a first batch needs more transitions than this run collects: nothing will be learnt"
     if trainer.setup.step:
         return  # the files of the setup may have gone since
     chosen = f"setup={config.setup}", f"world={config.world}", "fire=paper"  # which needs no file
