@@ -136,14 +136,6 @@ class RunConfig:
         settings = _settings("comm", value, MODULES)
         return {"name": value["name"], **asdict(settings)}
 
-    def check_rollouts(self, decisions: int = 1) -> None:
-        """Checks that an episode consists of whole rollouts, as a training needs."""
-        steps = decisions * self.policy.hold
-        if self.env.horizon % steps:
-            of = f"{decisions} decisions (policy.hold={self.policy.hold})"
-            wrong = f"env.horizon={self.env.horizon}"
-            raise UserError(f"{wrong}: must be a multiple of {steps}, the steps of {of}")
-
 
 def build_comm(config: RunConfig, num_envs: int) -> CommModule:
     """Returns a new communication module; warns if it does not heed delay and bandwidth."""

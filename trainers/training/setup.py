@@ -1,19 +1,19 @@
 """Sets up a training: the environments, the learner and the collector of a configuration."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.metadata import version
 from itertools import islice
 from typing import Any
 
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import TransformedEnv
 
 from emberlink.envs.utils.errors import UserError, require
 from emberlink.policies.hold import held
 from emberlink.trainers.build import build_env, build_learner
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.learners.base import Learner, Losses
+from emberlink.trainers.learners.base import Losses
 from emberlink.trainers.learners.tensors import copy_into, flatten, group, prefixed, unflatten
 from emberlink.trainers.rollout.collector import ResumableCollector
 from emberlink.trainers.training import warm_start
@@ -26,14 +26,28 @@ class TrainingSetup:
     def __init__(self, config: RunConfig):
         if tuple(map(int, version("torchrl").split(".")[:2])) < (0, 14):
             raise UserError(f"a training needs torchrl 0.14; installed is {version('torchrl')}")
+        if config.logger == "tensorboard":
+            require("tensorboard", "tensorboard", "logger=tensorboard")
         self.config, self.horizon = config, config.env.horizon
         self.total_steps = config.episodes * self.horizon
         self.step = 0
         """steps of the batch of environments so far"""
-        self.env = _make_env(config, config.num_envs)
-        self.learner = _make_learner(config, self.env)
+        self.env = build_env(
+            config,
+            num_envs=config.num_envs,
+            fire=config.fire,
+            seed=config.seed,
+            device=config.device,
+            hold=config.policy.hold,
+            true_map=config.learner.reads_map,
+            teacher=config.learner.reads_teacher,
+        )
+        self.learner = build_learner(config, self.env)
         self.rollout_steps = self.learner.rollout_steps * config.policy.hold
         """steps of the batch of environments in a rollout"""
+        if self.horizon % self.rollout_steps:
+            wrong = f"env.horizon={self.horizon}: must be a multiple of {self.rollout_steps}"
+            raise UserError(f"{wrong}, the steps of a rollout")
         self.collector = ResumableCollector(
             self.env,
             self.learner.explorer,
@@ -103,28 +117,4 @@ class TrainingSetup:
 
 def check_setup(config: RunConfig) -> None:
     """Checks that a configuration can be trained, in one environment, without training."""
-    warm_start.start(_make_learner(config, _make_env(config, 1)), config)
-
-
-def _make_env(config: RunConfig, num_envs: int) -> TransformedEnv:
-    """Returns training environments, with the map and teacher that the learner reads."""
-    if config.logger == "tensorboard":
-        require("tensorboard", "tensorboard", "logger=tensorboard")
-    config.check_rollouts()  # learners divide by the decisions of an episode
-    return build_env(
-        config,
-        num_envs=num_envs,
-        fire=config.fire,
-        seed=config.seed,
-        device=config.device,
-        hold=config.policy.hold,
-        true_map=config.learner.reads_map,
-        teacher=config.learner.reads_teacher,
-    )
-
-
-def _make_learner(config: RunConfig, env: TransformedEnv) -> Learner:
-    """Returns a new learner; validates before training."""
-    learner = build_learner(config, env)
-    config.check_rollouts(learner.rollout_steps)
-    return learner
+    warm_start.start(TrainingSetup(replace(config, num_envs=1)).learner, config)
