@@ -90,10 +90,10 @@ def build_env(
     return env
 
 
-def empty_env(config: RunConfig, num_envs: int = 1) -> TransformedEnv:
-    """Returns environments of a configuration without fire, for the specs of a policy."""
+def empty_env(config: RunConfig) -> TransformedEnv:
+    """Returns an environment of a configuration without fire, for the specs of a policy."""
     fire = torch.full(config.env.grid, torch.inf)
-    return build_env(config, num_envs=num_envs, fire=fire, seed=0, device=config.device)
+    return build_env(config, num_envs=1, fire=fire, seed=0, device=config.device)
 
 
 def build_actor(

@@ -9,7 +9,7 @@ from tiny_run import TINY
 from emberlink.trainers import train
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.terminal.signals import Interrupted, Interruption
+from emberlink.trainers.terminal.signals import Interruption
 from emberlink.trainers.training.trainer import Progress, Trainer
 
 INT, TERM, HUP = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
@@ -42,7 +42,7 @@ def test_signals_that_a_cluster_sends_together_let_the_training_save(numbers):
 
 @pytest.mark.parametrize("numbers", [(INT, INT), (TERM, INT), (USR2, INT)])
 def test_a_second_signal_of_the_user_ends_at_once(numbers):
-    with pytest.raises(Interrupted):
+    with pytest.raises(KeyboardInterrupt):
         send(*numbers)
 
 

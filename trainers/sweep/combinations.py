@@ -90,8 +90,6 @@ def combinations(arguments: Sequence[str]) -> list[Combination]:
         found.setdefault(identity(config), Combination(config, name, free))
     if not found:
         raise UserError("no run: a key has no value, as in seed=range(3,3)")
-    if "output" in several:
-        raise UserError("output: a sweep has one output folder")
     return list(found.values())
 
 

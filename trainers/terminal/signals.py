@@ -7,12 +7,8 @@ from types import FrameType
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 
 
-class Interrupted(KeyboardInterrupt):
-    """Reports a signal that ends the program at once."""
-
-
 class Interruption:
-    """Calls `stop` at the first signal and raises `Interrupted` at a later Ctrl-C (SIGINT).
+    """Calls `stop` at the first signal and raises KeyboardInterrupt at a later Ctrl-C (SIGINT).
 
     Clusters send several of the other signals together, so these never end the program at once.
     """
@@ -24,7 +20,7 @@ class Interruption:
         self.received: int | None = None
         """number of the first signal; None before it"""
         self.at_once = False
-        """whether even the first signal raises `Interrupted`"""
+        """whether even the first signal raises KeyboardInterrupt"""
 
     def __enter__(self) -> "Interruption":
         for number in self._signals:
@@ -37,7 +33,7 @@ class Interruption:
             signal.signal(number, handler)
         # A context manager of tensordict replaces the exception by another one.
         if self._raised and isinstance(error, Exception):
-            raise Interrupted from error
+            raise KeyboardInterrupt from error
 
     @property
     def status(self) -> int:
@@ -49,5 +45,5 @@ class Interruption:
         self.received = self.received or number
         if self.at_once or again:
             self._raised = True
-            raise Interrupted
+            raise KeyboardInterrupt
         self._stop()

@@ -11,7 +11,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import differences, resolve
 from emberlink.trainers.evaluation.scores import print_results, reporter
 from emberlink.trainers.terminal.progress import TrainingProgress
-from emberlink.trainers.terminal.signals import Interrupted, Interruption
+from emberlink.trainers.terminal.signals import Interruption
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import NonFiniteError, Trainer
 
@@ -38,7 +38,7 @@ def train(method: str, overrides: Sequence[str], console: Console) -> int:
             # The run folder stays locked during the evaluation.
             interruption.at_once = True
             if interruption.received:
-                raise Interrupted
+                raise KeyboardInterrupt
             if not setup.learner.updates:
                 text = "note: nothing was learnt: a batch needs more transitions than there were"
                 console.print(text, style="yellow", soft_wrap=True)
