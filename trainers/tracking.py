@@ -30,7 +30,8 @@ class Tracker:
         self._logger: Any = None
         if self._name == "none":
             return
-        self._logger = self._tried(lambda: _LOGGERS[self._name](config, run))
+        make = _wandb if self._name == "wandb" else _files
+        self._logger = self._tried(lambda: make(config, run))
         if self._name != "wandb":  # its server has the earlier episodes
             for line in run.metrics():
                 self.log(line)
@@ -99,23 +100,15 @@ def _wandb(config: RunConfig, run: RunFolder) -> Any:
     return logger
 
 
-def _tensorboard(_: RunConfig, run: RunFolder) -> Any:
-    """Returns a logger to new event files; removes the files from before a resume."""
-    from torchrl.record.loggers import TensorboardLogger
+def _files(config: RunConfig, run: RunFolder) -> Any:
+    """Returns a logger to RUN/csv/scalars/NAME.csv, or to event files in RUN/tensorboard.
 
-    shutil.rmtree(run.path / "tensorboard", ignore_errors=True)
-    return TensorboardLogger(exp_name="tensorboard", log_dir=str(run.path))
+    The files are written again in a resumed run.
+    """
+    from torchrl.record.loggers import get_logger
 
-
-def _csv(_: RunConfig, run: RunFolder) -> Any:
-    """Returns a logger to RUN/csv/scalars/NAME.csv, which is written again in a resumed run."""
-    from torchrl.record.loggers import CSVLogger
-
-    shutil.rmtree(run.path / "csv", ignore_errors=True)
-    return CSVLogger(exp_name="csv", log_dir=str(run.path))
-
-
-_LOGGERS = {"wandb": _wandb, "tensorboard": _tensorboard, "csv": _csv}
+    shutil.rmtree(run.path / config.logger, ignore_errors=True)
+    return get_logger(config.logger, str(run.path), config.logger)  # pyright: ignore
 
 
 def _log_at_the_end(

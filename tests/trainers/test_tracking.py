@@ -261,7 +261,7 @@ def test_a_tracker_that_fails(stage, how, tmp_path, monkeypatch):
         def close(self) -> None:
             self.at("finish")
 
-    monkeypatch.setitem(tracking._LOGGERS, "csv", Fragile)
+    monkeypatch.setattr(tracking, "_files", Fragile)
     said = {fail: "No space left", leave: "SystemExit"}[how]
     (message,) = train("csv", tmp_path)
     assert said in message
