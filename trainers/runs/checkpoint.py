@@ -91,7 +91,7 @@ def load_weights(path: Path, network: Any, config: RunConfig) -> dict[str, Tenso
     """Returns the weights of a checkpoint, which fit the actors `network` of a configuration."""
     expected = {ACTOR + name: value for name, value in network.state_dict().items()}
     header, every = read_header(path), read_tensors(path, WEIGHTS)
-    weights = {k: v for k, v in every.items() if k.startswith(ACTOR) or k in expected}
+    weights = {name: value for name, value in every.items() if name.startswith(ACTOR)}
     try:
         check_like(expected, weights)
     except ValueError as reason:

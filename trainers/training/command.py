@@ -1,14 +1,14 @@
 """Runs `emberlink train`: trains, shows the progress, evaluates."""
 
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 
 from rich.console import Console
 
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.compose import differences, resolve
+from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.scores import print_results, reporter
 from emberlink.trainers.terminal.progress import TrainingProgress
 from emberlink.trainers.terminal.signals import Interruption
@@ -60,7 +60,7 @@ def train(method: str, overrides: Sequence[str], console: Console) -> int:
 
 
 def _announce(trainer: Trainer, console: Console) -> None:
-    """Prints the method, the run folder, and notes about the training."""
+    """Prints the method, the run folder, and what is surprising about the training."""
     config, setup, run = trainer.config, trainer.setup, trainer.run
     if setup.step:
         console.print(f"resumed at step {setup.step} of {setup.total_steps}")
@@ -72,23 +72,10 @@ def _announce(trainer: Trainer, console: Console) -> None:
         more = f"{_resume_command(trainer)} episodes={2 * config.episodes}"
         console.print(f"{run.path} is finished; more episodes: {more}", soft_wrap=True)
         return
-    for note in _notes(trainer):
-        console.print(f"note: {note}", style="yellow", soft_wrap=True)
-
-
-def _notes(trainer: Trainer) -> Iterator[str]:
-    """Yields notes on surprising settings of a training."""
     if trainer.changed_versions:
-        made = f"the checkpoint was made with {trainer.changed_versions}"
-        yield f"{made}: the numbers may not be those of a run that was never stopped"
-    config = trainer.config
-    if trainer.setup.step:
-        return  # the files of the setup may have gone since
-    chosen = f"setup={config.setup}", f"world={config.world}", "fire=paper"  # which needs no file
-    usual = resolve("independent", chosen)
-    rewards = {k: v for k, v in differences(config, usual).items() if k.startswith("env.reward.")}
-    for key, (own, other) in rewards.items():
-        yield f"{key} is {own} here and {other} for independent: their rewards do not compare"
+        text = f"note: the checkpoint was made with {trainer.changed_versions}"
+        text += ": the numbers may not be those of a run that was never stopped"
+        console.print(text, style="yellow", soft_wrap=True)
 
 
 def _resume_command(trainer: Trainer) -> str:
