@@ -60,7 +60,7 @@ def train(method: str, overrides: Sequence[str], console: Console) -> int:
 
 
 def _announce(trainer: Trainer, console: Console) -> None:
-    """Prints the method, the run folder, and what is surprising about the training."""
+    """Prints the method, the run folder, and versions that differ from the checkpoint's."""
     config, setup, run = trainer.config, trainer.setup, trainer.run
     if setup.step:
         console.print(f"resumed at step {setup.step} of {setup.total_steps}")
