@@ -27,7 +27,7 @@ from emberlink.trainers.sweep.executors.base import EXECUTORS
 
 _FLOW: Any = {"default_flow_style": True, "width": math.inf}
 _BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
-_SKIPPED = {"comm", "learner", "fire", "saved_copy", "sha256", "test_sha256"}
+_SKIPPED = {"comm", "learner", "fire", "saved_copy", "sha256"}
 
 
 def setup(app: Sphinx) -> dict[str, Any]:

@@ -4,18 +4,16 @@ import dataclasses
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import STRICT, Name
 
 Units = Literal["steps", "seconds", "minutes", "hours", "days", "day_of_year"]
-COPY_FILE = "fires.npz"
+COPY_FILE = "fires.safetensors"
 """Name of the file in a run folder that holds the run's copy of its fires."""
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]
-_Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 _FORMAT = r"^((day|month|year)_first|(milli)?seconds|.*%.*)$"
 _Text = Annotated[str, Field(min_length=1, max_length=1000)]
 
@@ -39,7 +37,7 @@ class FileFireConfig:
     end: _Time | None = None
     """Time of the last step, as `start`; the last arrival if None."""
     minutes_per_step: Annotated[float, Field(gt=0, le=1e9)] | None = None
-    """Minutes of the fire per step of the episode, instead of `end`."""
+    """Minutes of the fire per step of the episode; takes the place of `end`."""
     margin: Annotated[float, Field(ge=0, le=0.45)] | None = 0.1
     """Part of the grid left free on each side of the burnt area; None takes the file's extent."""
     ring_width: Annotated[float, Field(gt=0, le=30)] | None = 3.0
@@ -64,20 +62,12 @@ class FileFireConfig:
     """Radius in metres of the circle that stands for a point, such as a detection of FIRMS."""
     unburned: float | tuple[float, ...] | Literal["none"] | None = None
     """Values of a raster, or states of masks, that are not fire; `none` if all values are times."""
-    sha256: _Digest | None = None
-    """SHA-256 of the file's content; a run records it when it begins and checks it afterwards."""
-    test_sha256: _Digest | None = None
-    """SHA-256 of the content of `test`, likewise."""
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    """SHA-256 of the content of `path` and `test`; a run records it and checks it afterwards."""
     saved_copy: Annotated[str | None, Field(exclude=True)] = dataclasses.field(
         default=None, compare=False
     )
     """A run's own copy of the grids; set when a run folder is opened, and never written."""
-
-    @model_validator(mode="after")
-    def _one_end(self) -> "FileFireConfig":
-        if self.end is not None and self.minutes_per_step is not None:
-            raise UserError("end and minutes_per_step: give one of them")
-        return self
 
     @property
     def never(self) -> tuple[float, ...] | None:

@@ -5,11 +5,9 @@ The driver follows from the first bytes, so that no text in a file can choose an
 """
 
 import hashlib
-import logging
 import re
-import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -46,29 +44,17 @@ _BESIDE = ".shx .dbf .prj .cpg -wal -journal .aux.xml .msk .ovr .aux .tfw .tifw 
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
-    """Silences the warnings and logs of the libraries. Damage is reported as an error instead."""
-    before = logging.root.manager.disable
-    logging.disable(logging.CRITICAL)
-    try:
-        with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
-            yield
-    finally:
-        logging.disable(before)
-
-
-@contextmanager
-def naming_file(file: str, layer: str | None = None) -> Iterator[Path]:
-    """Gives the path of a file, and names it and its layer in errors."""
+def named(file: str, layer: str | None = None) -> Iterator[Path]:
+    """Gives the path of a file, and names it and its layer in errors; warnings are silenced."""
     path = user_path(file)
     place = f"{path}, layer {layer}" if layer else str(path)
     try:
-        yield path
+        with warnings.catch_warnings(action="ignore"):  # damage is reported as an error
+            yield path
     except UserError as error:
         raise UserError(printable(f"{place}: {error}")) from None
-    except (OSError, MemoryError) as error:
-        why = getattr(error, "strerror", None) or "not enough memory"
-        raise UserError(printable(f"{place}: {why}")) from None
+    except OSError as error:
+        raise UserError(printable(f"{place}: {error.strerror}")) from None
 
 
 @contextmanager
@@ -79,8 +65,7 @@ def damage(expected: str) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
-        hidden = error.__cause__ if "previous exception" in str(error) else None
-        lines = str(hidden or error).strip().splitlines() or [type(error).__name__]
+        lines = str(error.__cause__ or error).strip().splitlines() or [type(error).__name__]
         raise ask(lines[0][:200], expected) from None
 
 
@@ -88,11 +73,13 @@ def find_format(path: Path) -> str:
     """Returns the format of a file or folder, and checks that it is safe to open."""
     if path.is_dir():
         return "grids" if members(path)[0].name.startswith(_GRID) else "folder"
-    kind = _format(path)
-    if kind in ("csv", "kml", "points", "json") and (size := path.stat().st_size) > MAX_BYTES:
+    kind, size = _format(path), path.stat().st_size
+    if kind in ("csv", "kml", "points", "json") and size > MAX_BYTES:
         raise ask(f"{size} bytes", f"a text file of at most {MAX_BYTES}")
-    for part in (path, *_beside(path)):
-        _check_size(part)
+    # To GDAL, shapes that are cut off are empty. The seventh number of the header is the length.
+    if kind == "shp" and size < (told := 2 * int(np.fromfile(path, ">i4", 7)[-1])):
+        raise ask(f"it is damaged: {size} bytes", f"{told} bytes")
+    for part in _beside(path):
         # GDAL opens masks and overviews in any format; some formats read other addresses.
         if part.suffix.lower() in (".msk", ".ovr") and _format(part) != "tif":
             raise ask(f"{part.name}, beside it, is no TIFF", "one, or no such file")
@@ -112,20 +99,6 @@ def _format(path: Path) -> str:
     raise ask(f"{path.name} begins with {head[:16]!r}", f"{known}, the paper's text")
 
 
-def _check_size(path: Path) -> None:
-    """Checks that a file has the bytes that its header declares; GDAL reads the rest of it."""
-    with open_regular(path, 2**63) as file:
-        head = file.read(100).ljust(100, b"\0")
-    records, start, row = struct.unpack("<IHH", head[4:12])
-    told = {
-        ".dbf": start + records * row,
-        ".gpkg": int.from_bytes(head[16:18]) * int.from_bytes(head[28:32]),
-        **dict.fromkeys((".shp", ".shx"), 2 * int.from_bytes(head[24:28])),
-    }.get(path.suffix.lower(), 0)
-    if path.stat().st_size < told:
-        raise ask(f"{path.name} is damaged", f"{told} bytes or more")
-
-
 def _beside(path: Path) -> list[Path]:
     """Returns the files that belong to a file, with its name and an ending, in any case."""
     names = {f"{name}{end}".lower() for name in (path.stem, path.name) for end in _BESIDE.split()}
@@ -141,13 +114,13 @@ def members(folder: Path) -> list[Path]:
     return sorted(paths, key=lambda path: (len(path.name), path.name))
 
 
-def digest(path: Path) -> str:
-    """Returns the SHA-256 of a file and the files beside it, or of a folder's fires."""
+def digest(files: Iterable[str]) -> str:
+    """Returns the SHA-256 of files and the files beside them, and of the fires of folders."""
     content = hashlib.sha256()
-    for main in members(path) if path.is_dir() else [path]:
-        for part in (main, *_beside(main)):
-            with open_regular(part, 2**63) as file:
-                size = part.stat().st_size
-                content.update(f"{part.name.removeprefix(path.stem)}:{size}:".encode())
-                hashlib.file_digest(file, lambda: content)  # pyright: ignore
+    for file in files:
+        with named(file) as path:
+            mains = members(path) if path.is_dir() else [path]
+            for part in [part for main in mains for part in (main, *_beside(main))]:
+                with open_regular(part, 2**63) as opened:
+                    content.update(hashlib.file_digest(opened, "sha256").digest())
     return content.hexdigest()

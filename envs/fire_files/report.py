@@ -5,8 +5,7 @@ from datetime import datetime, timedelta
 
 from emberlink.envs.utils.errors import UserError
 
-SECONDS = {"seconds": 1.0, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
-SECONDS["day_of_year"] = SECONDS["days"]
+SECONDS = {"seconds": 1, "minutes": 60, "hours": 3600, "days": 86400, "day_of_year": 86400}
 
 
 @dataclass

@@ -51,15 +51,15 @@ def test_a_copy_is_used_for_its_own_grid_only_and_a_changed_file_is_named(source
     path = tmp_path / "fire.asc"
     path.write_bytes(source.read_bytes())
     config = with_checksum(FileFireConfig(path=str(path), units="minutes"))
-    save_copy(config, tmp_path / "run", GRID, HORIZON)
-    config = dataclasses.replace(config, saved_copy=str(tmp_path / "run" / COPY_FILE))
+    save_copy(config, tmp_path, GRID, HORIZON)
+    config = dataclasses.replace(config, saved_copy=str(tmp_path / COPY_FILE))
     expected = fire_sets(config, GRID, HORIZON)
     path.write_text(path.read_text().replace("-9999.0", "-9999.00"))
     assert torch.equal(fire_sets(config, GRID, HORIZON).train, expected.train)
     for changed, grid in ((config, (10, 12)), (dataclasses.replace(config, margin=0.2), GRID)):
         with pytest.raises(ValueError, match=r"fire\.asc: has changed"):
             fire_sets(changed, grid, HORIZON)
-    (tmp_path / "run" / COPY_FILE).write_bytes(b"PK damaged")
+    (tmp_path / COPY_FILE).write_bytes(b"damaged")
     with pytest.raises(ValueError, match=r"fire\.asc: has changed"):
         fire_sets(config, GRID, HORIZON)
 
