@@ -52,7 +52,9 @@ def on_grid(
     steps = (np.maximum(times, start) - start) / (end - start) * horizon
     burning = steps[np.isfinite(steps)]
     if len(burning) < 2 or (not in_steps and burning.min() == burning.max()):
-        raise _no_fire(fire, start, end)
+        ends = map(fire.clock.format, (start, end, fire.first, fire.last))
+        seen = "from {} to {} no fire spreads; it burns from {} to {}".format(*ends)
+        raise UserError("; ".join([seen, *report.doubts]))
     return steps.astype(np.float32)
 
 
@@ -66,8 +68,6 @@ def _span(fire: "Raster | Perimeters", config: FileFireConfig, horizon: int) -> 
         if clock.unit not in SECONDS:
             raise ask(f"fire.minutes_per_step: times are in {clock.unit}", "fire.units")
         end = start + horizon * steps * 60 / SECONDS[clock.unit]
-    if end < min(start, fire.first) or start >= min(fire.last, end):
-        raise _no_fire(fire, start, end)
     return start, end
 
 
@@ -83,11 +83,6 @@ def _time(key: str, fire: "Raster | Perimeters", config: FileFireConfig) -> floa
         date = in_utc(parse_dates([value], config.time_format, f"fire.{key}")[0])
         return (date - clock.origin).total_seconds() / SECONDS[clock.unit]
     return fire.first + value * SECONDS[str(config.units)] / SECONDS[clock.unit]
-
-
-def _no_fire(fire: "Raster | Perimeters", *span: float) -> UserError:
-    start, end, first, last = map(fire.clock.format, (*span, fire.first, fire.last))
-    return UserError(f"from {start} to {end} no fire spreads; it burns from {first} to {last}")
 
 
 def _beginnings(times: np.ndarray) -> int:

@@ -138,11 +138,9 @@ def _on_plane(shapes: Any, config: FileFireConfig, report: Report) -> Any:
     x0, y0, x1, y1 = (float(value) for value in shapes.total_bounds)
     plane = choose_plane(shapes.crs, config.crs, (x0, y0, x1, y1))
     report.facts.append(plane.about)
-    shapes = shapes.force_2d()
-    if plane.target is not None:
-        shapes = shapes.set_crs(plane.source, allow_override=True).to_crs(plane.target)
-        if not np.isfinite(shapes.total_bounds).all():
-            raise ask(f"features outside {plane.target.name}", "another fire.crs")
+    shapes = shapes.force_2d().transform(lambda at: np.stack(plane.project(*at.T), 1))
+    if not np.isfinite(shapes.total_bounds).all():
+        raise ask("features outside the projection", "another fire.crs")
     if config.radius is not None:
         points = shapes.geom_type.isin(("Point", "MultiPoint"))
         shapes = shapes.where(~points, shapes.buffer(config.radius / plane.unit))

@@ -1,9 +1,6 @@
 """Reads rasters of arrival times: ESRI ASCII, GeoTIFF, NetCDF, arrays of states, banks, points."""
 
-import math
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -140,7 +137,7 @@ def read_raster(
                 times, clock, what = _band(dataset, kind == "nc", config)
     nowhere = Plane("no place in the file: square cells, the first row in the north")
     fire = as_fire(times, clock, nowhere)
-    if crs is not None or not (np.allclose(affine, np.eye(3)) or np.allclose(affine, fire.matrix)):
+    if crs is not None or not np.allclose(affine, np.eye(3)):
         fire.matrix = affine
         fire.plane = choose_plane(crs, config.crs, fire.bounds(None))
     begin, end = clock.format(fire.first), clock.format(fire.last)
@@ -149,8 +146,7 @@ def read_raster(
     return [fire]
 
 
-@contextmanager
-def _opened(path: Path, kind: str, layer: str | None) -> Iterator[Any]:
+def _opened(path: Path, kind: str, layer: str | None) -> Any:
     """Opens a raster by the driver of its name."""
     import rasterio
 
@@ -164,17 +160,16 @@ def _opened(path: Path, kind: str, layer: str | None) -> Iterator[Any]:
             raise ask(seen, f"the one of arrival times, such as fire.layer={some}")
         name = f'NETCDF:"{name}":{layer}' if found else name
     more: Any = {"DATATYPE": "Float64"} if kind == "asc" else {}
-    with rasterio.open(name, driver=_DRIVERS[kind], **more) as dataset:
-        yield dataset
+    return rasterio.open(name, driver=_DRIVERS[kind], **more)
 
 
 def _read(dataset: Any, most: int, band: int | None = None) -> np.ndarray:
     """Reads a band or all, [bands, rows, columns], of bounded size and a type of real numbers."""
     count = 1 if band else dataset.count
-    size = max(count * dataset.width * dataset.height, *map(math.prod, dataset.block_shapes))
+    size = count * dataset.height * dataset.width
     if size > most or np.dtype(dataset.dtypes[0]).kind not in "iuf":
         seen = f"{count} x {dataset.height} x {dataset.width} cells of {dataset.dtypes[0]}"
-        raise ask(f"{seen}, in blocks of {dataset.block_shapes[0]}", f"{most} real numbers at most")
+        raise ask(seen, f"{most} real numbers at most")
     return dataset.read([band] if band else None)
 
 
