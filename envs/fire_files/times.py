@@ -29,17 +29,17 @@ _MAPPED = (
 _HOUR, _MINUTE = r"(.*hours?|hora|heure|uhr|hr|h)(utc|gmt|z|local)?", r"min(ute)?s?"
 _OF_DAY = rf"{_HOUR}|{_MINUTE}|.*(time(utc|gmt|z|local)?|hhmm|clock|ampm)"
 _MIDNIGHT = r"[T ](00:00(:00)?([.]0+)?|12:00(:00)? AM)(Z|[+]00(:?00)?)?$"
-_DAYS = {
-    **dict.fromkeys(("%Y-%m-%d", "%Y-%j", "%d-%b-%Y", "%d-%b-%y", "%b-%d-%Y", "%Y%m%d"), ""),
-    **dict.fromkeys(("%d-%m-%Y", "%d-%m-%y"), "day_first"),
-    **dict.fromkeys(("%m-%d-%Y", "%m-%d-%y"), "month_first"),
-    "%y-%m-%d": "year_first",
+_DAYS = ("%Y-%m-%d", "%Y-%j", "%d-%b-%Y", "%d-%b-%y", "%b-%d-%Y", "%Y%m%d")
+"""Patterns of days; - is any separator."""
+_ORDERS = {
+    "day_first": ("%d-%m-%Y", "%d-%m-%y"),
+    "month_first": ("%m-%d-%Y", "%m-%d-%y"),
+    "year_first": ("%y-%m-%d",),
 }
-"""Patterns of days, and the `fire.time_format` that each needs; - is any separator."""
-_ORDERS = ("day_first", "month_first", "year_first")
+"""More patterns, by the `fire.time_format` that each needs."""
 _SINCE_1970 = {"seconds": 1, "milliseconds": 1000}
 _DIGITS = {
-    0: _ORDERS,
+    0: tuple(_ORDERS),
     8: ("%Y%m%d",),
     10: ("seconds", "%y%m%d%H%M", "%Y%m%d%H"),
     12: ("%Y%m%d%H%M",),
@@ -290,8 +290,7 @@ def _read(text: str, form: str) -> datetime:
     clock = f"{part['hour']:0>2}{part['minute']:0>2}{part['second']:0>2}{part['half']}"
     clocks = f"{'%I%M%S%p' if part['half'] else '%H%M%S'}{'%z' if zone else ''}"
     clock += "m" * bool(part["half"]) + zone
-    for pattern, needs in _DAYS.items():
+    for pattern in (*_DAYS, *_ORDERS.get(form, ())):
         with suppress(ValueError):
-            if needs in ("", form):
-                return datetime.strptime(f"{day} {clock}", f"{pattern} {clocks}")
+            return datetime.strptime(f"{day} {clock}", f"{pattern} {clocks}")
     raise ValueError(text)
