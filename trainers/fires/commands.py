@@ -3,7 +3,6 @@
 import io
 import os
 import re
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -49,8 +48,7 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
     if path is None:
         stem = re.sub(r"[^\w.+-]", "-", f"fire_{Path(name).stem}_{index}")[:100]
         path = Path(f"{free_name(output or Path(), stem, ['.png'])}.png")
-    with created(path) as partial, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph")  # the font may lack letters of the file's name
+    with created(path) as partial:
         arrival_figure(partial, arrival, world.horizon, shown(title))
     grid = " x ".join(map(str, world.grid))
     first = f"{shown(title)}: {grid} cells, {world.horizon} steps, setup {config.setup}"
@@ -92,9 +90,6 @@ def _divided(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 
 def _config(overrides: Sequence[str], source: str) -> RunConfig:
     """Returns the configuration of a scenario or a file, or of the `fire=` among the keys."""
-    for text in overrides:
-        if not text.startswith(("setup=", "env.", "fire.", "fire=")):
-            raise UserError(f"{shown(text)!r}: a fire depends on keys of setup, env. and fire.")
     known = source in scenarios()
     if source and not known and not os.path.exists(source):
         hint = unknown(source, scenarios())

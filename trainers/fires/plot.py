@@ -27,8 +27,7 @@ def arrival_figure(path: Path, arrival: NDArray[np.float32], horizon: int, title
         contours = axes.contour(shown, levels=levels, colors="white", linewidths=1.1)
         axes.clabel(contours, fmt="%g", fontsize="small")
     axes.set(xlim=(-0.5, across - 0.5), ylim=(-0.5, up - 0.5), xlabel="x, cells", ylabel="y, cells")
-    short = title if len(title) <= 60 else f"{title[:32]}...{title[-25:]}"
-    figure.suptitle(short, parse_math=False, fontsize="medium")
+    figure.suptitle(title, parse_math=False, fontsize="medium")
     figure.colorbar(picture, ax=axes, label="arrival time, steps", shrink=0.9)
     samples = [
         Patch(fc=BURNT_OUT, label="burnt out before step 0"),
