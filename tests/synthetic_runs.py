@@ -70,7 +70,6 @@ def write_run(
             "world": config["world"],
             "seed": seed,
             "start_seed": 1,
-            "checkpoint": "step_000000120.safetensors",
             "fires": fires,
             "results": {"huygens": results},
         },

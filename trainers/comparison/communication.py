@@ -10,8 +10,8 @@ import pandas as pd
 from emberlink.envs import metrics
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.bootstrap import Values
-from emberlink.trainers.comparison.reading import RADIO, Run
-from emberlink.trainers.comparison.tables import WARM_START, Frame, radio_text, trained_with
+from emberlink.trainers.comparison.reading import Run
+from emberlink.trainers.comparison.tables import RADIO, WARM_START, Frame, radio_text, trained_with
 from emberlink.trainers.evaluation.scores import LEARNED
 
 SCRIPTED = ("map_greedy", "courier")

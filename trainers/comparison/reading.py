@@ -6,16 +6,16 @@ A configuration is read as plain values, so that runs of earlier versions stay r
 import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, ConfigDict, Field
+from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat
 from pydantic.dataclasses import dataclass as checked
 
 from emberlink.envs.utils.errors import UserError, naming
-from emberlink.envs.utils.validation import from_plain, shown
+from emberlink.envs.utils.validation import from_plain
 from emberlink.trainers.config.values import flat
 from emberlink.trainers.evaluation.foreign import foreign_name
 from emberlink.trainers.evaluation.scores import LEARNED
@@ -26,16 +26,6 @@ from emberlink.trainers.runs.run_folder import MAX_JSON, RunFolder, read_text
 LeftOut = tuple[str, str]
 """a folder or file that is not compared, and the reason"""
 Settings = Annotated[dict[str, Any], AfterValidator(infinite)]
-_RADIO = "range", "loss", "bandwidth", "burst", "delay", "fade", "shared"
-RADIO = tuple(f"env.radio.{key}" for key in _RADIO)
-_TYPES: dict[str, Any] = {
-    **dict.fromkeys(("method", "setup", "world", "fire.name"), str),
-    **dict.fromkeys(("seed", "edition", "episodes", "num_envs", "env.horizon"), int),
-    **dict.fromkeys(RADIO, bool | int | float | None),
-    "evaluation.headline": str | None,
-}
-"""keys that are read here -> their type, with None if they may be missing"""
-_Measured = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
 
 
 @checked(frozen=True, config=ConfigDict(extra="ignore"))
@@ -44,17 +34,13 @@ class Evaluation:
 
     start_seed: int
     """seed of the start positions"""
-    checkpoint: str
-    """file name of the checkpoint that was evaluated"""
     fires: Annotated[int, Field(ge=1)]
     """episodes per policy and fire"""
-    results: Annotated[dict[str, dict[str, dict[str, list[_Measured]]]], Field(min_length=1)]
+    results: Annotated[dict[str, dict[str, dict[str, list[FiniteFloat]]]], Field(min_length=1)]
     """fire -> policy -> measure -> one number per episode"""
     step: int = 0
-    """step of training of the checkpoint; 0 in files that have only its name"""
+    """step of training of the checkpoint"""
     world: str = "paper"
-    held_out: Settings = Field(default_factory=dict)
-    """fire -> description of the held-out fires"""
     message_fault: str = "none"
     """`evaluation.message_fault`"""
     failed: str = ""
@@ -88,7 +74,7 @@ class Run:
     @property
     def headline(self) -> str:
         """The headline measure of the run's world."""
-        return self.settings.get("evaluation.headline") or "coverage"
+        return self.settings["evaluation.headline"]
 
 
 def read_all(
@@ -97,10 +83,8 @@ def read_all(
     """Returns the finished runs of paths, one entry per evaluation, and the runs left out."""
     if labels and len(labels) != len(paths):
         raise UserError(f"{len(labels)} labels for {len(paths)} paths: one each")
-    folders: dict[Path, tuple[Path, str]] = {}
-    for path, label in zip(paths, labels or [""] * len(paths), strict=True):
-        for folder in find(path):
-            folders.setdefault(folder.resolve(), (folder, label))
+    named = zip(paths, labels or [""] * len(paths), strict=True)
+    folders = [(folder, label) for path, label in named for folder in find(path)]
     runs: list[Run] = []
     left_out: list[LeftOut] = []
 
@@ -108,10 +92,10 @@ def read_all(
     def or_left_out(path: Path) -> Iterator[None]:
         try:
             yield
-        except (UserError, OSError) as error:
+        except (OSError, ValueError) as error:
             left_out.append((str(path), str(error)))
 
-    for folder, label in sorted(folders.values()):
+    for folder, label in sorted(folders):
         with or_left_out(folder):
             run = read(folder)
             runs.append(run := replace(run, name=label or run.name))
@@ -128,8 +112,6 @@ def find(path: Path | str) -> list[Path]:
         return pretrained.find(str(path))
     if (folder / "config.yaml").is_file():
         return [folder]
-    if not folder.is_dir():
-        raise UserError(f"{folder}: there is no such run folder")
     if not (found := [file.parent for file in folder.glob("*/config.yaml")]):
         raise UserError(f"{folder}: neither a run folder nor a folder that holds runs")
     return found
@@ -138,8 +120,7 @@ def find(path: Path | str) -> list[Path]:
 def read(path: Path) -> Run:
     """Returns a run; a UserError if it is not finished or not evaluated, or a file is damaged."""
     folder = RunFolder(path)
-    settings = {"world": "paper", "edition": 1, **flat(folder.values())}
-    _check_types(settings, path / "config.yaml")
+    settings = {"edition": 1, **flat(folder.values())}
     name = foreign_name(folder)
     lines, episodes = ([], 0) if name else (folder.metrics(), settings["episodes"])
     if len(lines) < episodes:
@@ -148,50 +129,35 @@ def read(path: Path) -> Run:
     if not (path / "eval.json").exists():
         raise UserError(f"not evaluated: there is no eval.json ({again})")
     evaluation = read_evaluation(path / "eval.json")
-    trained, tested = evaluation.step, evaluation.step
-    with suppress(UserError):  # no checkpoint, or a damaged one: the numbers can be compared
-        trained = folder.step()
-    if trained != tested:
+    tested = evaluation.step
+    if folder.newest.exists() and (trained := folder.step()) != tested:
         raise UserError(
             f"eval.json is of step {tested}, the newest checkpoint of {trained} ({again})"
         )
     return Run(path, name or settings["method"], settings, lines[:episodes], evaluation)
 
 
-def _check_types(settings: Mapping[str, Any], file: Path) -> None:
-    for key, kind in _TYPES.items():
-        if not isinstance(value := settings.get(key), kind):
-            wrong = "missing" if value is None else f"wrong: {shown(value)}"
-            raise UserError(f"{file}: key {key!r} is {wrong}")
-
-
 def read_evaluation(file: Path) -> Evaluation:
     """Returns the content of an eval.json."""
     with naming(file):
         evaluation = from_plain(Evaluation, json.loads(read_text(file, MAX_JSON)))
-    for fire, policies in evaluation.results.items():
-        if LEARNED not in policies:
-            why = evaluation.failed or f"results.{fire} has no policy {LEARNED!r}"
-            raise UserError(f"{file}: {why}")
-        for policy, measured in policies.items():
-            if any(len(values) != evaluation.fires for values in measured.values()):
-                raise UserError(f"{file}: {policy} on {fire}: not {evaluation.fires} episodes")
+    if evaluation.failed:
+        raise UserError(f"{file}: {evaluation.failed}")
     return evaluation
 
 
 def evaluated_otherwise(run: Run, file: Path) -> list[Run]:
     """Returns a run as evaluated in an eval_*.json; none if it repeats the settings of eval.json.
 
-    A UserError if the file is damaged, or its checkpoint or fires differ from eval.json.
+    A UserError if the file is damaged, or its step or fires differ from eval.json.
     """
     evaluation = read_evaluation(file)
     learned = evaluation.communication.get(LEARNED, {})
     now = flat({"world": evaluation.world, "env": evaluation.environment, "comm": learned})
-    _check_types({**run.settings, **now}, file)
     changed = {key: value for key, value in now.items() if run.settings.get(key) != value}
     if evaluation.message_fault != run.evaluation.message_fault:
         changed["evaluation.message_fault"] = evaluation.message_fault
-    names = ("world", "checkpoint", "step", "fires", "start_seed")
+    names = ("world", "step", "fires", "start_seed")
     apart = [n for n in names if getattr(evaluation, n) != getattr(run.evaluation, n)]
     apart += [key for key in ("env.horizon", "env.grid") if key in changed]
     if changed and apart:

@@ -12,19 +12,20 @@ from typing import Any
 
 import pandas as pd
 
-from emberlink.trainers.comparison.reading import RADIO, LeftOut, Run
+from emberlink.trainers.comparison.reading import LeftOut, Run
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH
-from emberlink.trainers.config.values import flat
 from emberlink.trainers.evaluation.scores import LEARNED
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import without_time_and_seed
 
 NOT_COMPARED = ("seed", "output", "evaluation", *NOT_LEARNT_WITH)
 """first parts of keys that do not affect training"""
+_RADIO = "range", "loss", "bandwidth", "burst", "delay", "fade", "shared"
+RADIO = tuple(f"env.radio.{key}" for key in _RADIO)
 WARM_START = "learner.warm_start"
 _FIRST = ("learner.name", "policy.memory")
 """keys that name a group before all others, which often follow from them"""
-_OF_SECTION = ("setup", "world", "edition", "env.horizon", "env.grid", "fires", "start_seed")
+_OF_SECTION = ("setup", "world", "edition", "env.horizon", "env.grid")
 
 Frame = Any
 """a pandas table; the types that pandas infers for its parts are too wide to be checked"""
@@ -34,11 +35,9 @@ def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
     """Returns one row per evaluation of a run, by section, label and seed, and the runs left out.
 
     Of several runs of a label with one seed, the last by name is used, and a copy of the package's
-    policy only if there is no other. Runs that were evaluated on other fires than the first of
-    their section are left out.
+    policy only if there is no other.
     """
-    runs = sorted(runs, key=lambda r: (r.settings["seed"], r.path.name, r.path))
-    runs.sort(key=lambda run: not pretrained.is_copy(run.path))
+    runs = sorted(runs, key=lambda run: (not pretrained.is_copy(run.path), run.path.name))
     of_section = settings_table(pd.Series([_of_section(run) for run in runs]))
     table: Frame = pd.DataFrame([_row(run) for run in runs])
     table["section"] = named(table["section"], of_section.drop(columns=["setup", "world"]))
@@ -50,18 +49,15 @@ def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
         (row["run"], f"seed {row['seed']} of {row['label']} is there twice")
         for row in table[twice].to_dict("records")
     ]
-    table = table[~twice].sort_values(["section", "label", "seed"], ignore_index=True)
-    first = table.groupby("section")[["object", "run"]].transform("first")
-    alike = [_same_fires(*pair) for pair in zip(first["object"], table["object"], strict=True)]
-    same = pd.Series(alike, table.index)
-    why = "not evaluated on the fires of " + first["run"] + " (emberlink eval RUN)"
-    return table[same], left_out + list(zip(table["run"][~same], why[~same], strict=True))
+    return table[~twice].sort_values(["section", "label", "seed"], ignore_index=True), left_out
 
 
 def _of_section(run: Run) -> dict[str, Any]:
     """Returns the settings that are the same for all runs of a section."""
-    about = {**run.settings, "fires": run.evaluation.fires, "start_seed": run.evaluation.start_seed}
-    return {k: v for k, v in about.items() if k in _OF_SECTION or k.startswith("fire.")}
+    about = {k: v for k, v in run.settings.items() if k in _OF_SECTION or k.startswith("fire.")}
+    tested = run.evaluation
+    sets = ", ".join(tested.results)
+    return about | {"fires": tested.fires, "start_seed": tested.start_seed, "held_out": sets}
 
 
 def _row(run: Run) -> dict[str, Any]:
@@ -146,13 +142,6 @@ def radio_text(settings: Mapping[str, Any]) -> str:
     parts += ["fade"] if fade and reach < math.inf else []
     parts += [f"{word(most)} bytes{' shared' * bool(shared)}"] if most is not None else []
     return ", ".join(parts) or "no limits"
-
-
-def _same_fires(first: Run, other: Run) -> bool:
-    """Returns whether two evaluations are of the same fires, by the values that both hold."""
-    one, two = (flat(run.evaluation.held_out) for run in (first, other))
-    same = all(two[key] == value for key, value in one.items() if key in two)
-    return same and first.evaluation.results.keys() == other.evaluation.results.keys()
 
 
 def means_table(runs: Frame) -> Frame:
