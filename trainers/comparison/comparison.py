@@ -1,7 +1,6 @@
 """Compares runs and holds the results as tables."""
 
 import json
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -33,8 +32,6 @@ class Difference(NamedTuple):
 class Comparison:
     """The results of a comparison, as pandas tables."""
 
-    paths: tuple[Path, ...]
-    """compared folders, as given"""
     runs: Frame
     """one row per evaluation of a run"""
     means: Frame
@@ -70,11 +67,6 @@ class Comparison:
         """The names of the sections."""
         return list(self.runs["section"].unique())
 
-    @property
-    def command(self) -> str:
-        """The command line of the comparison."""
-        return shlex.join(["emberlink", "compare", *sorted(map(str, self.paths))])
-
     def difference(
         self, first: str, second: str, measure: str, fires: str = "", section: str = ""
     ) -> Difference:
@@ -105,7 +97,6 @@ class Comparison:
         of_label = self.curves.groupby(["section", "label", "measure"], sort=False)
         values = {
             "settings": about(),
-            "command": self.command,
             "left_out": [{"run": path, "why": why} for path, why in self.left_out],
             "notes": self.notes,
             "runs": _records(self.runs.drop(columns=["object", "settings"])),
@@ -169,6 +160,5 @@ def compare_runs(paths: Sequence[Path], labels: Sequence[str] = ()) -> Compariso
         pd.concat([table for table in column if len(table)] or column[:1], ignore_index=True)
         for column in zip(*parts, strict=True)
     )
-    return Comparison(
-        tuple(paths), runs, means, ranking, claims, communication, curves, notes, left_out + others
-    )
+    left_out += others
+    return Comparison(runs, means, ranking, claims, communication, curves, notes, left_out)

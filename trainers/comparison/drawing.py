@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+from matplotlib.ticker import MaxNLocator
 
 from emberlink.envs import metrics
 from emberlink.trainers.comparison.tables import Frame
@@ -34,12 +34,9 @@ DASHES = tuple((0, dash) for dash in ((7, 3), (7, 2, 1, 2), (3, 2), (12, 4), (1,
 """line styles of scripted policies"""
 FROZEN = ("coverage", "tracking_first", "tracking_last", "boundary_exits")
 """measures of the figure of frozen policies, besides the world's headline"""
-LOGARITHMIC = {"tracking_first": 1.0, "boundary_exits": 0.1}
-"""measure with a logarithmic axis in that figure -> value below which the axis is linear"""
 FROZEN_CAPTION = (
     "frozen policies. Small dots: each seed's mean over the fires. Large dot: interquartile mean "
-    "over seeds; line: 95 % bootstrap interval, none with one seed. Dashed: scripted policies. The "
-    "first UAV's step and exits are on a logarithmic scale, linear near 0."
+    "over seeds; line: 95 % bootstrap interval, none with one seed. Dashed: scripted policies."
 )
 CURVES_CAPTION = (
     "The exploring policy in each episode of training, mean over its environments. Line: "
@@ -102,10 +99,6 @@ def frozen(ranking: Frame, labels: Sequence[str]) -> Figure:
             axes.plot([row["low"], row["high"]], [y, y], "|-", lw=2, ms=9, mew=1.5, **style)
         for row in scripted[scripted["measure"] == measure].to_dict("records"):
             axes.axvline(row["iqm"], **dashes[row["label"]])
-        if measure in LOGARITHMIC:
-            axes.set_xscale("symlog", linthresh=LOGARITHMIC[measure])
-            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            axes.set_xlim(left=0)
         better = "more" if measure in metrics.HIGHER_IS_BETTER else "less"
         axes.set(xlabel=f"{CURVES.get(measure, measure)}\n({better} is better)")
         axes.set_ylim(-0.5, len(order) - 0.5)

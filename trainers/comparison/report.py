@@ -9,7 +9,6 @@ from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import quote
 
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
@@ -179,21 +178,21 @@ def write_report(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     source = files("emberlink.trainers.comparison").joinpath("page.html").read_text("utf-8")
-    contents: dict[str, bytes] = {}
+    with naming(f"output {folder}"):
+        folder.mkdir(parents=True, exist_ok=True)
 
     def saved(chapter: int, figure: Figure, name: str, caption: str) -> dict[str, str]:
-        for kind, changing in (("png", "Software"), ("pdf", "CreationDate"), ("svg", "Date")):
-            if kind == "png" or kind in extras:
-                file = BytesIO()
-                figure.savefig(file, format=kind, dpi=120, metadata={changing: None})
-                contents[f"{chapter}_{name}.{kind}"] = file.getvalue()
-        png = base64.b64encode(contents.pop(f"{chapter}_{name}.png")).decode()
-        return {"uri": f"data:image/png;base64,{png}", "caption": caption}
+        for kind in {"pdf", "svg"} & {*extras}:
+            figure.savefig(folder / f"{chapter}_{name}.{kind}")
+        png = BytesIO()
+        figure.savefig(png, format="png", dpi=120)
+        data = base64.b64encode(png.getvalue()).decode()
+        return {"uri": f"data:image/png;base64,{data}", "caption": caption}
 
     chapters = []
     for place, section in enumerate(comparison.sections, 1):
         say(f"figures of {section}")
-        chapters.append(_chapter(comparison, section, folder, partial(saved, place)))
+        chapters.append(_chapter(comparison, section, partial(saved, place)))
     page = environment.from_string(source).render(
         comparison=comparison, chapters=chapters, settings=about(), numbers=NUMBERS
     )
@@ -204,20 +203,14 @@ def write_report(
         texts["compare.tex"] = _latex(comparison)
     if "marl-eval" in extras:
         texts["marl_eval.json"] = _marl_eval(comparison)
-    # Names of folders may hold bytes that are no characters.
-    contents |= {name: text.encode(errors="backslashreplace") for name, text in texts.items()}
-    with naming(f"output {folder}"):
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, content in contents.items():
-            (folder / name).write_bytes(content)
+    for name, text in texts.items():
+        # Names of folders may hold bytes that are no characters.
+        (folder / name).write_text(text, errors="backslashreplace")
     return comparison
 
 
 def _chapter(
-    comparison: Comparison,
-    section: str,
-    folder: Path,
-    saved: Callable[[Figure, str, str], dict[str, str]],
+    comparison: Comparison, section: str, saved: Callable[[Figure, str, str], dict[str, str]]
 ) -> dict[str, Any]:
     """Draws the figures of a section, and returns its part of the page."""
     runs, ranking, curves = (
@@ -242,7 +235,7 @@ def _chapter(
         "frozen": frozen,
         "tables": tables(comparison, section),
         "training": training,
-        "details": _details(runs, folder),
+        "details": _details(runs),
     }
 
 
@@ -277,7 +270,7 @@ def _marl_eval(comparison: Comparison) -> str:
     return json.dumps({"emberlink": tasks}) + "\n"
 
 
-def _details(runs: Frame, folder: Path) -> list[Table]:
+def _details(runs: Frame) -> list[Table]:
     """Returns the settings in which the labels of a section differ, and its runs."""
     settings = differing(runs).rename_axis("policy").reset_index()
     trained = runs[runs["as_trained"]]
@@ -285,12 +278,7 @@ def _details(runs: Frame, folder: Path) -> list[Table]:
     rows["episodes of training"] = [len(run.lines) for run in trained["object"]]
     rows["folder"] = trained["run"]
     pages = [Path(run) / "figures" / "replay.html" for run in trained["run"]]
-    rows["replay"] = [
-        quote(os.fsencode(os.path.relpath(page.resolve(), folder.resolve())))
-        if page.is_file()
-        else ""
-        for page in pages
-    ]
+    rows["replay"] = [page.resolve().as_uri() if page.is_file() else "" for page in pages]
     return [
         Table("Settings that differ", "", settings.astype(str)),
         Table("Runs", "", rows.astype(str)),
