@@ -25,7 +25,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from emberlink.envs import metrics
-from emberlink.trainers.comparison import bootstrap, drawing
+from emberlink.trainers.comparison import bootstrap, drawing, rankings
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "docs" / "data"
@@ -142,10 +142,8 @@ def rise(samples: Any, _: str) -> Any:
 
 def ratio(samples: Any, measure: str) -> Any:
     """Returns how many times better a method is than the best other one, with its interval."""
-    share = partial(bootstrap.iqm_ratio_share, higher=measure in metrics.HIGHER_IS_BETTER)
     means = [values.mean(1) for values in samples if len(values)]
-    ends = bootstrap.interval(share, *means)
-    return bootstrap.as_ratio(float(share(*means))), ends and [*map(bootstrap.as_ratio, ends)]
+    return bootstrap.ratio_to_best(*means, higher=measure in metrics.HIGHER_IS_BETTER)
 
 
 FUNCTIONS: dict[str, Any] = {
@@ -197,16 +195,8 @@ def curves(study: str, labels: Sequence[str], measures: Sequence[str]) -> Figure
     for key in product(labels, measures):
         if key in every:
             points = every[key].pivot(index="seed", columns="fire", values="value")
-            values, draws = points.to_numpy(), bootstrap.BAND_RESAMPLES
-            ends = bootstrap.interval(bootstrap.iqm, values, axis=0, resamples=draws)
-            about = {
-                "label": key[0],
-                "measure": key[1].rpartition("/")[2],
-                "episode": points.columns,
-            }
-            low, high = ends or (np.nan, np.nan)
-            middle = bootstrap.iqm(values, axis=0)
-            rows.append(pd.DataFrame({**about, "iqm": middle, "low": low, "high": high}))
+            about = {"label": key[0], "measure": key[1].rpartition("/")[2]}
+            rows.append(rankings.band(points.to_numpy(), points.columns, **about))
     none = pd.DataFrame(columns=["label", "measure", "iqm"])
     shown = [measure.rpartition("/")[2] for measure in measures]
     figure = drawing.training(pd.concat(rows), none, shown, labels)
@@ -228,8 +218,7 @@ def pack(name: str, *folders: str) -> None:
     The label of a folder without one is its name, that of a .json of `world check` the world. Rows
     that are there already are replaced.
     """
-    rows: dict[Any, Any] = {}
-    curves, configs = [], {}
+    rows, curves, configs = [], [], {}
     for label, _, folder in (text.rpartition("=") for text in folders):
         label = label or Path(folder).name
         for file in sorted(Path(folder).rglob("eval*.json")):
@@ -238,12 +227,12 @@ def pack(name: str, *folders: str) -> None:
             for fires, policies in found["results"].items():
                 on = changed + (f":{fires}" if len(found["results"]) > 1 else "")
                 for policy, measured in policies.items():
-                    own = (label, found["seed"]) if policy == "learned" else (policy, None)
+                    run, seed = (label, found["seed"]) if policy == "learned" else (policy, None)
                     for measure, values in measured.items():
-                        rows.setdefault((own[0] + on, own[1], measure), values)
+                        rows += [(run + on, seed, measure, *one) for one in enumerate(values)]
         if folder.endswith(".json"):  # of `emberlink world check`
             for policy, measured in json.loads(Path(folder).read_text())[label]["means"].items():
-                rows |= {(policy, None, name): [mean] for name, mean in measured.items()}
+                rows += [(policy, None, name, 0, mean) for name, mean in measured.items()]
         for file in sorted(Path(folder).rglob("eval.json")):
             config = yaml.safe_load(file.with_name("config.yaml").read_text())
             learner = config["learner"]
@@ -254,9 +243,8 @@ def pack(name: str, *folders: str) -> None:
             means = lines.groupby((np.arange(len(lines)) // size + 1) * size).mean()
             part = means.rename_axis("episode").melt(var_name="measure", ignore_index=False)
             curves.append(part.dropna().reset_index().assign(run=label, seed=config["seed"]))
-    table = [(*key, fire, x) for key, values in rows.items() for fire, x in enumerate(values)]
     columns = ["run", "seed", "measure", "fire", "value"]
-    add(DATA / f"{name}.csv.xz", pd.DataFrame(table, columns=columns))
+    add(DATA / f"{name}.csv.xz", pd.DataFrame(rows, columns=columns))
     if curves:
         add(DATA / f"{name}.curves.csv.xz", pd.concat(curves))
         file = DATA / f"{name}.yaml"

@@ -7,6 +7,7 @@ of improvement.
 
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,13 @@ def iqm_ratio_share(sample: Values, *others: Values, higher: bool, axis: int = -
 def as_ratio(share: float) -> float:
     """Returns the ratio x / y of a share x / (x + y); infinite for 1."""
     return share / (1 - share) if share < 1 else float("inf")
+
+
+def ratio_to_best(*samples: Values, higher: bool) -> tuple[float, Interval | None]:
+    """Returns the ratio of the first IQM to the best other, above 1 if better, and its interval."""
+    share = partial(iqm_ratio_share, higher=higher)
+    ends = interval(share, *samples)
+    return as_ratio(float(share(*samples))), ends and (as_ratio(ends[0]), as_ratio(ends[1]))
 
 
 def interval(

@@ -1,6 +1,5 @@
 """Tests the claims of the paper (sections V and VI) with intervals over seeds."""
 
-from functools import partial
 from itertools import product
 from typing import Any
 
@@ -63,14 +62,12 @@ def _verdict(means: Frame, label: str, measure: str, factor: float) -> dict[str,
     values = {name: part.to_numpy(float) for name, part in means.groupby("label")["value"]}
     samples = [values.pop(label), *values.values()]
     higher = measure in metrics.HIGHER_IS_BETTER
-    share = partial(bootstrap.iqm_ratio_share, higher=higher)
-    shares = bootstrap.interval(share, *samples)
-    ends = shares and (bootstrap.as_ratio(shares[0]), bootstrap.as_ratio(shares[1]))
+    ratio, ends = bootstrap.ratio_to_best(*samples, higher=higher)
     iqms = [float(bootstrap.iqm(sample)) for sample in samples[1:]]
     low, high = ends or (None, None)
     return {
         "best_other": [*values][iqms.index(max(iqms) if higher else min(iqms))],
-        "ratio": bootstrap.as_ratio(float(share(*samples))),
+        "ratio": ratio,
         "low": low,
         "high": high,
         "verdict": decision(ends, factor),

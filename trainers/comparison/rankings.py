@@ -8,7 +8,7 @@ import pandas as pd
 
 from emberlink.envs import metrics
 from emberlink.trainers.comparison import bootstrap
-from emberlink.trainers.comparison.bootstrap import BAND_RESAMPLES
+from emberlink.trainers.comparison.bootstrap import BAND_RESAMPLES, Values
 from emberlink.trainers.comparison.tables import Frame, learned, settings_table, trained_settings
 from emberlink.trainers.evaluation.scores import CURVES, LEARNED
 
@@ -117,10 +117,14 @@ def curves(runs: Frame) -> Frame:
     for label, group in trained.groupby("label"):
         for measure in CURVES:
             values = np.array([[line[measure] for line in r.lines] for r in group["object"]], float)
-            ends = bootstrap.interval(bootstrap.iqm, values, axis=0, resamples=BAND_RESAMPLES)
-            low, high = ends or (np.nan, np.nan)
             about = {"section": group["section"].iloc[0], "label": label, "measure": measure}
-            numbers = {"iqm": bootstrap.iqm(values, 0), "low": low, "high": high}
-            episode = np.arange(1, values.shape[1] + 1)
-            parts.append(pd.DataFrame({**about, "episode": episode, **numbers}))
+            parts.append(band(values, np.arange(1, values.shape[1] + 1), **about))
     return pd.concat(parts[1:] or parts, ignore_index=True)
+
+
+def band(values: Values, episodes: Any, **about: Any) -> Frame:
+    """Returns the interquartile mean of curves, [seeds, episodes], and the ends of its interval."""
+    ends = bootstrap.interval(bootstrap.iqm, values, axis=0, resamples=BAND_RESAMPLES)
+    low, high = ends or (np.nan, np.nan)
+    middle = bootstrap.iqm(values, axis=0)
+    return pd.DataFrame({**about, "episode": episodes, "iqm": middle, "low": low, "high": high})
