@@ -90,7 +90,7 @@ def test_a_file_imports_what_is_beside_it(source):
         Path(folder, "up.py").write_text("UP = [0.0, 0.0, 1.0]")
         Path(folder, "net.py").write_text(BESIDE.format(dots))
     Path("package/__init__.py").touch()
-    for name in ("plain/net.py:act", "package/net.py:act", "package.net:act"):
+    for name in ("plain/net.py:act", "package.net:act"):
         assert score(name) == score("mine.py:rise")
 
 

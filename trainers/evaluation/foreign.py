@@ -21,7 +21,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.utils import get_primers_from_module
 
 from emberlink.envs import keys
-from emberlink.envs.utils.errors import UserError, naming, require
+from emberlink.envs.utils.errors import UserError, require
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.pretrained import is_name
 from emberlink.trainers.runs.run_folder import MAX_YAML, RunFolder, read_text
@@ -165,7 +165,8 @@ def new_run(reference: str, name: str, config: RunConfig) -> RunFolder:
 
 def foreign_name(run: RunFolder) -> str:
     """Returns the name of a run's policy if emberlink has not trained it, else an empty text."""
-    return _read(run, "name") if (run.path / FOREIGN).exists() else ""
+    file = run.path / FOREIGN
+    return json.loads(read_text(file, MAX_YAML))["name"] if file.exists() else ""
 
 
 def reference_of(run: RunFolder) -> str:
@@ -174,7 +175,7 @@ def reference_of(run: RunFolder) -> str:
     A folder from somebody else must not name code that came with it, so it is a whole path outside
     of the folder.
     """
-    text = _read(run, "policy")
+    text = json.loads(read_text(run.path / FOREIGN, MAX_YAML))["policy"]
     file = Path(_split(text)[0] or text)
     if not text:
         why = "its policy was an object, which cannot be opened again; file.py:NAME can"
@@ -183,12 +184,6 @@ def reference_of(run: RunFolder) -> str:
     if inside or not file.is_absolute():
         raise UserError(f"{run.path / FOREIGN}: names no policy outside of its folder: {text!r}")
     return text
-
-
-def _read(run: RunFolder, key: str) -> str:
-    file = run.path / FOREIGN
-    with naming(file, KeyError, TypeError):
-        return str(json.loads(read_text(file, MAX_YAML))[key])
 
 
 def is_reference(text: str) -> bool:
@@ -203,9 +198,7 @@ def open_policy(text: str) -> tuple[Any, str]:
     UserError if there is no such file, module or name, or importing it fails.
     """
     if text.endswith(".onnx"):
-        if not (file := Path(text)).is_file():
-            raise UserError(f"{text}: there is no such file")
-        return OnnxPolicy(file), str(file.absolute())
+        return OnnxPolicy(Path(text)), str(Path(text).absolute())
     place, name = (text, "") if text.endswith(".py") else _split(text)
     try:
         module = _module(place)
@@ -226,25 +219,19 @@ def _split(text: str) -> tuple[str, str]:
 
 def _module(place: str) -> Any:
     """Imports a module of the working folder, or a file, which may import what is beside it."""
-    name, folders = place, [""]  # as with python -m
-    if is_file := place.endswith(".py"):
-        folder = Path(place).absolute().parent
-        name, folders = Path(place).stem, [str(folder)]  # as with python FILE
-        while (folder / "__init__.py").exists():
-            name, folder = f"{folder.name}.{name}", folder.parent
-        folders.append(str(folder))
-    sys.path[:0] = folders
+    is_file = place.endswith(".py")
+    folder = str(Path(place).absolute().parent) if is_file else ""  # as with python FILE or -m
+    sys.path.insert(0, folder)
     try:
-        if not is_file or folders[0] != folders[1]:
-            return importlib.import_module(name)
+        if not is_file:
+            return importlib.import_module(place)
         spec: Any = importlib.util.spec_from_file_location(place, place)
         module = importlib.util.module_from_spec(spec)
         sys.modules[place] = module  # where dataclasses look for it
         spec.loader.exec_module(module)
         return module
     finally:
-        for path in folders:
-            sys.path.remove(path)
+        sys.path.remove(folder)
 
 
 def takes_state(policy: Callable[..., Any]) -> bool:
