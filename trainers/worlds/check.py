@@ -1,9 +1,10 @@
 """Runs `emberlink world check`: plays scripted policies and tests the conditions of a world."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from rich.console import Console
 
@@ -15,7 +16,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.evaluate import BLOCK, VALIDATION_START_SEED, play_scripted
-from emberlink.trainers.evaluation.scores import Measured, means, means_table
+from emberlink.trainers.evaluation.scores import means, means_table
 from emberlink.trainers.runs import compact_json
 
 Split = Literal["test", "validation"]
@@ -40,17 +41,8 @@ class Condition(NamedTuple):
     policies: str
     ratio: float
     """headline of the first, in % of the second's"""
-    bound: float
-    kind: str = "at least"
-
-    @property
-    def passes(self) -> bool:
-        """Whether the ratio keeps the bound."""
-        return self.ratio <= self.bound if self.kind == "at most" else self.ratio >= self.bound
-
-    def __str__(self) -> str:
-        verdict = "pass" if self.passes else "FAIL"
-        return f"{verdict}: {self.policies}: {self.ratio:.1f} %; {self.kind} {self.bound:g}"
+    bound: str
+    passes: bool
 
 
 def conditions(means: Means, headline: str) -> list[Condition]:
@@ -67,18 +59,20 @@ def conditions(means: Means, headline: str) -> list[Condition]:
     def best(belongs: Callable[[str], bool]) -> str:
         return max(filter(belongs, sorted(means)), key=lambda policy: means[policy][headline])
 
-    def condition(one: str, other: str, *bound: Any) -> Condition:
-        share = 100 * means[one][headline] / max(means[other][headline], 1e-9)
-        return Condition(f"{headline} of {one} / {other}", share, *bound)
+    def condition(one: str, other: str, least: float = 0.0, most: float = math.inf) -> Condition:
+        ratio = 100 * means[one][headline] / max(means[other][headline], 1e-9)
+        bound = f"at least {least:g}" if least else f"at most {most:g}"
+        name = f"{headline} of {one} / {other}"
+        return Condition(name, ratio, bound, passes=least <= ratio <= most)
 
     oracle = best(lambda policy: policy.startswith(ORACLE))
-    merged, none = (
-        best(lambda policy, end=end: policy.endswith(end)) for end in ("_all", "_alone")
-    )
+    merged = best(lambda policy: policy.endswith("_all"))
+    none = best(lambda policy: policy.endswith("_alone"))
+    others = best(lambda policy: not policy.startswith(ORACLE))
     return [
-        condition(RANDOM, oracle, MOST_AT_RANDOM, "at most"),
-        condition(merged, none, 100 + LEAST_GAIN),
-        condition(oracle, best(lambda policy: not policy.startswith(ORACLE)), 100 + LEAST_AHEAD),
+        condition(RANDOM, oracle, most=MOST_AT_RANDOM),
+        condition(merged, none, least=100 + LEAST_GAIN),
+        condition(oracle, others, least=100 + LEAST_AHEAD),
     ]
 
 
@@ -102,24 +96,6 @@ def world_config(overrides: Sequence[str]) -> RunConfig:
     return config
 
 
-def played(
-    config: RunConfig,
-    policy: str,
-    *,
-    fires: int,
-    split: Split,
-    report: Callable[[str], None] = lambda _: None,
-) -> Measured:
-    """Returns the measures of a scripted policy, from the cache if they are in it.
-
-    `fires` is the number of test or validation fires, one episode each.
-    """
-    arrival = fires_of(config.fire).fires(split, fires, config.env.grid, config.env.horizon)
-    of_validation = {"start_seed": VALIDATION_START_SEED, "block": min(fires, BLOCK)}
-    seeds = of_validation if split == "validation" else {}
-    return play_scripted(config, policy, arrival, **seeds, report=report)
-
-
 def check(
     arguments: Sequence[str],
     console: Console,
@@ -140,11 +116,14 @@ def check(
         raise UserError("world=NAME: the worlds are given without a key here")
     names = [text for text in arguments if text not in overrides] or suite(console)
     configs = [world_config([f"world={name}", *overrides]) for name in dict.fromkeys(names)]
+    of_validation = {"start_seed": VALIDATION_START_SEED, "block": min(fires, BLOCK)}
+    seeds = of_validation if split == "validation" else {}
     record = {}
     for config in configs:
         say = partial(console.print, f"  {config.world} is played by", style="dim")
+        arrival = fires_of(config.fire).fires(split, fires, config.env.grid, config.env.horizon)
         measured = {
-            policy: means(played(config, policy, fires=fires, split=split, report=say))
+            policy: means(play_scripted(config, policy, arrival, report=say, **seeds))
             for policy in config.evaluation.scripted
         }
         headline = config.evaluation.headline
@@ -153,12 +132,14 @@ def check(
         order = sorted(metrics.names(config.env), key=lambda name: name != headline)
         console.print(means_table(title, measured.items(), order))
         for condition in found:
-            console.print(str(condition), style="" if condition.passes else "red", soft_wrap=True)
+            verdict, style = ("pass", "") if condition.passes else ("FAIL", "red")
+            told = f"{condition.policies}: {condition.ratio:.1f} %; {condition.bound}"
+            console.print(f"{verdict}: {told}", style=style, soft_wrap=True)
         console.print()
         record[config.world] = {
             **{"fires": fires, "split": split, "headline": headline},
             "passes": all(condition.passes for condition in found),
-            "conditions": [{**one._asdict(), "passes": one.passes} for one in found],
+            "conditions": [condition._asdict() for condition in found],
             "means": measured,
         }
     if output is not None:
