@@ -34,8 +34,6 @@ def reduced(run: RunFolder) -> RunConfig:
 
 def pack(run: RunFolder, target: Path, *, half: bool = False) -> Path:
     """Copies a finished run without training states and critics; with `half`, the actors alone."""
-    if target.exists():
-        raise UserError(f"{target}: exists already")
     config, prefix = reduced(run), f"{checkpoint.WEIGHTS}{ACTOR}"
     actors = checkpoint.read_tensors(run.newest, prefix)
     target.mkdir(parents=True)

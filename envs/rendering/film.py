@@ -14,17 +14,11 @@ from PIL import Image
 
 from emberlink.envs.utils.errors import UserError
 
-_COLOURS = (
-    "scale=out_color_matrix=bt709:out_range=tv,"
-    "setparams=color_primaries=bt709:color_trc=bt709:colorspace=bt709:range=tv"
-)
-
 # H.264 with 4:2:0 chroma, which all browsers support. A constant rate factor of 18 and the tune
-# for animations preserve flat colours and sharp edges. The colour matrix is stored, so that players
-# do not guess it. With "faststart" a video can start before it is loaded completely.
+# for animations preserve flat colours and sharp edges. With "faststart" a video can start before it
+# is loaded completely.
 _OPTIONS = [
     *("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18", "-tune", "animation"),
-    *("-vf", _COLOURS),
     *("-threads", "1", "-movflags", "+faststart", "-f", "mp4"),
 ]
 
