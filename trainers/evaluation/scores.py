@@ -7,7 +7,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from emberlink.envs import metrics
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.terminal.console import plain_table
 
@@ -64,18 +63,16 @@ def reporter(console: Console) -> Callable[[str, str], None]:
 def print_results(console: Console, results: Results, config: RunConfig, policy: str = "") -> None:
     """Prints means over episodes: a table per fire, a row per policy, a column per measure.
 
-    Measures besides the paper's have a second table. `policy` is the name of the learned policy;
-    its method if empty.
+    `policy` is the name of the learned policy; its method if empty.
     """
     called = policy or config.method
     for fire, by_policy in results.items():
-        others = [name for name in by_policy[LEARNED] if name not in metrics.NAMES]
-        episodes = len(by_policy[LEARNED]["coverage"])
+        measured = by_policy[LEARNED]
+        episodes = len(measured["coverage"])
         settings = f"{episodes} episodes, mean; setup {config.setup}, world {config.world}"
         rows = [(called if p == LEARNED else p, means(m)) for p, m in by_policy.items()]
-        for measures in filter(None, (metrics.NAMES, others)):
-            title = f"test fires: {fire} ({settings})"
-            console.print(means_table(title, rows, measures, bold=called))
+        title = f"test fires: {fire} ({settings})"
+        console.print(means_table(title, rows, [*measured], bold=called))
 
 
 def means_table(
