@@ -52,11 +52,11 @@ def _blank_figures(request, monkeypatch) -> None:
         return
     from matplotlib.figure import Figure
 
-    from emberlink.trainers.evaluation import evaluate_run, figures
+    from emberlink.trainers.evaluation import evaluate_run
 
     blank = _blank()
     for name in ("timelapse", "training_curves"):
-        monkeypatch.setattr(figures, name, lambda path, *_: path.write_bytes(blank))
+        monkeypatch.setattr(evaluate_run, name, lambda path, *_: path.write_bytes(blank))
 
     def save(_: Figure, file: io.BytesIO | Path, **__) -> None:
         file.write(blank) if isinstance(file, io.BytesIO) else file.write_bytes(blank)

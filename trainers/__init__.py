@@ -6,11 +6,12 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.lazy import lazy
 
 if TYPE_CHECKING:
-    from emberlink.trainers.api import Run, TrainedPolicy, compare, evaluate, load, resume, train
+    from emberlink.trainers.api import Run, compare, evaluate, resume, train
     from emberlink.trainers.build import make_env
     from emberlink.trainers.config.compose import resolve
     from emberlink.trainers.config.schema import RunConfig
     from emberlink.trainers.evaluation.export import export
+    from emberlink.trainers.evaluation.policy import TrainedPolicy, load
     from emberlink.trainers.training.trainer import Trainer
 
 __all__ = [
@@ -32,11 +33,12 @@ __all__ = [
 __getattr__ = lazy(
     __name__,
     {
-        "api": "Run TrainedPolicy compare evaluate load resume train",
+        "api": "Run compare evaluate resume train",
         "build": "make_env",
         "config.compose": "resolve",
         "config.schema": "RunConfig",
         "evaluation.export": "export",
+        "evaluation.policy": "TrainedPolicy load",
         "training.trainer": "Trainer",
     },
 )

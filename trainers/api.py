@@ -18,10 +18,8 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import GROUPS
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
 from emberlink.trainers.evaluation.evaluate_run import evaluate_run
-from emberlink.trainers.evaluation.foreign import new_run
-from emberlink.trainers.evaluation.policy import TrainedPolicy, adopted, load_policy
+from emberlink.trainers.evaluation.policy import adopted, load
 from emberlink.trainers.evaluation.scores import Results
-from emberlink.trainers.runs import pretrained
 from emberlink.trainers.terminal.signals import Interruption
 from emberlink.trainers.training.resume import resume as resumed
 from emberlink.trainers.training.trainer import Progress, Trainer
@@ -154,35 +152,11 @@ def evaluate(
     else:
         chosen = [f"{key}={settings.pop(key)}" for key in GROUPS if key in settings]
         settings |= {} if device is None else {"device": device}
-        played, reference = adopted(policy, method, chosen, name=name, **settings)
-        if name:
-            return evaluate_run(new_run(reference, name, played.config), played, report=report)
+        played, run = adopted(policy, method, chosen, name=name, **settings)
+        if run is not None:
+            return evaluate_run(run, played, report=report)
     fires = played.config.evaluation.episodes
     return evaluate_policy(played.config, played.actor, fires=fires, report=report)
-
-
-def load(
-    run: Reference,
-    *,
-    checkpoint: Reference | None = None,
-    device: str | None = None,
-    **settings: Any,
-) -> TrainedPolicy:
-    """Returns the frozen policy of a run.
-
-    Args:
-        run: a run folder, or `pretrained:METHOD`.
-        checkpoint: file of networks; the newest of the run if None.
-        device: device of the networks; the run's if None.
-        settings: `world`, settings of its fire (`"fire.path"`), or settings of `env`, `comm` or
-            `evaluation` to change, as for `train`; the networks must fit.
-
-    Raises:
-        UserError: there is no such run, a file in it is damaged, or a setting does not fit.
-    """
-    file = None if checkpoint is None else user_path(checkpoint)
-    folder = pretrained.read_run(os.fspath(run))
-    return load_policy(folder, (), settings, checkpoint=file, device=device)
 
 
 def compare(

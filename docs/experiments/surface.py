@@ -4,9 +4,9 @@
 
 A POLICY is a run, `pretrained:METHOD`, or the name of a scripted policy. Each plays frozen, in the
 world of `key=value`, on the same test fires with each radio, with the radio off and without limits.
-NAME.jsonl gets a line for each; what is in it is not played again. NAME.png is drawn at the end or
-at Ctrl-C, and without a POLICY from the lines that are there. It shows the gain of messages in the
-headline and, below, their value (docs/comparison.md), with 95 % intervals over fires.
+NAME.jsonl gets a line for each; what is in it is not played again. NAME.png is drawn from its lines
+at the end, at Ctrl-C, and without a POLICY. It shows the gain of messages in the headline and,
+below, their value (docs/comparison.md), with 95 % intervals over fires.
 """
 
 import json
@@ -22,8 +22,7 @@ from emberlink.envs.scenarios import fires_of
 from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.trainers.comparison.communication import gain_and_value
 from emberlink.trainers.evaluation.evaluate import play_learned, play_scripted
-from emberlink.trainers.evaluation.policy import load_policy
-from emberlink.trainers.runs.pretrained import read_run
+from emberlink.trainers.evaluation.policy import load
 from emberlink.trainers.worlds.check import world_config
 
 FIRES = 20
@@ -40,7 +39,7 @@ FULL = "env.radio.range=.inf", "env.radio.fade=false", *RADIOS[3 * len(LOSSES)]
 def measured(policy: str, settings: list[str]) -> dict:
     """Returns the world, the headline and its value on each fire."""
     scripted = policy in SCRIPTED.known()
-    loaded = None if scripted else load_policy(read_run(policy), settings, device="cpu")
+    loaded = None if scripted else load(policy, settings, device="cpu")
     config = world_config(settings) if loaded is None else loaded.config
     fires = fires_of(config.fire).fires("test", FIRES, config.env.grid, config.env.horizon)
     if loaded is None:
@@ -89,18 +88,17 @@ def main(name: str, *words: str) -> None:
     path = Path(f"{name}.jsonl")
     text = path.read_text().splitlines() if path.exists() else []
     found = {tuple(line["played"]): line for line in map(json.loads, text)}
-    simple_first = sorted(RADIOS, key=lambda radio: len({*radio} - {*FULL}))
     try:
-        for radio, policy in product([OFF, FULL, *simple_first], policies):
+        for radio, policy in product([OFF, FULL, *RADIOS], policies):
             played = (policy, *changes, *radio)
             if played not in found:
                 found[played] = {"played": played, **measured(policy, [*changes, *radio])}
                 with path.open("a") as file:
                     file.write(json.dumps(found[played]) + "\n")
     finally:
-        drawn = policies or [*{played[0]: 0 for played in found}]
         if found:
-            draw(found, drawn, changes, Path(f"{name}.png"))
+            drawn = dict.fromkeys(played[0] for played in found)
+            draw(found, [*drawn], changes, Path(f"{name}.png"))
 
 
 main(*sys.argv[1:])

@@ -1,8 +1,8 @@
 """Chooses and plays the episodes that are shown side by side."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -28,25 +28,13 @@ SHARED = ("grid", "num_uavs", "horizon", "altitude")
 """keys of `env` on which fires and start positions depend"""
 
 
-@dataclass(frozen=True)
-class Panel:
+class Panel(NamedTuple):
     """A policy that plays an episode of the evaluation, and the title of that episode."""
 
     title: str
     config: RunConfig
     policy: Callable[[WildfireEnv], TensorDictModuleBase]
     """returns the policy for an environment"""
-
-    def play(self, arrival: Tensor, index: int) -> Recording:
-        """Plays and records episode `index` of the evaluation on a fire, [1, X, Y].
-
-        It has the same place in its batch as in an evaluation, so that the numbers are the same to
-        the last bit.
-        """
-        recorder = Recorder(index % BLOCK)
-        seed = START_SEED + index - recorder.member
-        play_blocks(self.config, self.policy, arrival, start_seed=seed, watch=recorder.add)
-        return recorder.recording(self.title)
 
 
 def scripted(config: RunConfig, names: Sequence[str]) -> Iterator[Panel]:
@@ -81,7 +69,11 @@ def play_side_by_side(
     index: int,
     report: Callable[[str], None] = lambda _: None,
 ) -> list[Recording]:
-    """Plays the same episode of each panel; `report` is called with a line of text after each."""
+    """Plays episode `index` of the evaluation on a fire, [1, X, Y], with the policy of each panel.
+
+    It has the same place in its batch as in an evaluation, so that the numbers are the same to the
+    last bit. `report` is called with a line of text after each.
+    """
     world = panels[0].config.env
     for panel, name in product(panels, SHARED):
         expected, actual = getattr(world, name), getattr(panel.config.env, name)
@@ -90,9 +82,11 @@ def play_side_by_side(
                 f"{panel.title} has env.{name}={actual}, {panels[0].title} has {expected}: "
                 f"side by side, {', '.join(SHARED)} must be the same"
             )
-    episodes = []
+    member, episodes = index % BLOCK, []
     for panel in panels:
-        episode = panel.play(arrival, index)
+        recorder, seed = Recorder(member), START_SEED + index - member
+        play_blocks(panel.config, panel.policy, arrival, start_seed=seed, watch=recorder.add)
+        episode = recorder.recording(panel.title)
         report(f"  {panel.title}: coverage {episode.coverage(episode.horizon):.1f} %")
         episodes.append(episode)
     return episodes

@@ -3,25 +3,30 @@
 import argparse
 import hashlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
+from pathlib import Path
+from typing import Any
 
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from rich.console import Console
 
 from emberlink.envs.rendering.film import write_gif
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError, naming
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.evaluation import evaluate, figures
-from emberlink.trainers.evaluation.foreign import FOREIGN, foreign_name, is_reference, new_run
-from emberlink.trainers.evaluation.policy import TrainedPolicy, adopted, load_policy
-from emberlink.trainers.evaluation.scores import LEARNED, Results, print_results, reporter
+from emberlink.trainers.evaluation import evaluate
+from emberlink.trainers.evaluation.foreign import FOREIGN, foreign_name, is_reference
+from emberlink.trainers.evaluation.policy import TrainedPolicy, adopted, load
+from emberlink.trainers.evaluation.scores import CURVES, LEARNED, Results, print_results, reporter
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.recording import Recorder, Recording
-from emberlink.trainers.replay.screen import Screen, even_steps
+from emberlink.trainers.replay.screen import Screen, draw_step, even_steps
 from emberlink.trainers.runs.checkpoint import read_header, versions
-from emberlink.trainers.runs.pretrained import open_run, read_run
+from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.run_folder import RunFolder
 
 _MAX_LABEL = 150
@@ -32,10 +37,9 @@ def run_command(options: argparse.Namespace, console: Console) -> int:
     """Runs `emberlink eval`: evaluates a run, prints the table and returns 0."""
     changes, file = options.overrides, options.checkpoint
     if is_reference(options.folder) or options.name:
-        (policy, run), changes = _new_run(options), []
+        (policy, run), changes = _adopted(options), []
     else:
-        folder, device = read_run(options.folder), options.device
-        policy = load_policy(folder, changes, checkpoint=file, device=device)
+        policy = load(options.folder, changes, checkpoint=file, device=options.device)
         run = open_run(options.folder)  # copies a trained policy of the package once all is checked
     parts = [file.stem] if file else []
     parts += [re.sub(r"[^\w.=+-]", "-", text) for text in changes]
@@ -48,7 +52,7 @@ def run_command(options: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def _new_run(options: argparse.Namespace) -> tuple[TrainedPolicy, RunFolder]:
+def _adopted(options: argparse.Namespace) -> tuple[TrainedPolicy, Any]:
     """Returns a policy that is evaluated with a method and a name, and its new run folder."""
     method, *settings = options.overrides or [""]
     if not method or "=" in method or not options.name or options.checkpoint:
@@ -57,8 +61,7 @@ def _new_run(options: argparse.Namespace) -> tuple[TrainedPolicy, RunFolder]:
             "--name NAME; METHOD says which observations it reads"
         )
     settings += [f"device={options.device}"] if options.device else []
-    policy, reference = adopted(options.folder, method, settings, name=options.name)
-    return policy, new_run(reference, options.name, policy.config)
+    return adopted(options.folder, method, settings, name=options.name)
 
 
 def evaluate_run(
@@ -121,12 +124,44 @@ def _draw(run: RunFolder, config: RunConfig, episode: Recording, label: str) -> 
     if lines := run.metrics():
         title = f"{config.method}, setup {config.setup}, fire {config.fire.name}"
         with run.figure("training.png") as path:
-            figures.training_curves(path, lines, title)
+            training_curves(path, lines, title)
     name = evaluate.shown_scenario(config)
     with run.figure(f"episode_{name}{label}.gif") as path:
         screen = Screen([episode], size=480)
         write_gif(path, map(screen.picture, even_steps(config.env.horizon, 100)))
     with run.figure(f"timelapse_{name}{label}.png") as path:
-        figures.timelapse(path, episode)
+        timelapse(path, episode)
     with run.figure(f"replay{label}.html") as path:
         Replay([episode], f"{name}:0").save(path)
+
+
+def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) -> None:
+    """Draws the paper's figures 5 to 9 for one run as PNG.
+
+    Keys of `lines`, as in metrics.jsonl, are measures of the exploring policy, and "fire/measure"
+    for the frozen policy on validation fires.
+    """
+    figure = Figure(figsize=(11, 6), layout="constrained")
+    figure.suptitle(title)
+    table = pd.DataFrame(lines).set_index("episode")
+    for axes, (name, label) in zip(figure.subplots(2, 3).flat, CURVES.items(), strict=True):
+        axes.plot(table[name], color="0.6", label="with noise")
+        for key, values in table.filter(regex=f"/{name}$").items():
+            shown = f"without noise, {str(key).partition('/')[0]}"
+            axes.plot(values.dropna(), marker="o", ms=3, label=shown)
+        axes.set(xlabel="episode", ylabel=label)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.grid(alpha=0.3)
+    for text in figure.axes[0].legend(fontsize="small").get_texts():
+        text.set_parse_math(False)
+    figure.savefig(path, format="png", dpi=120)
+
+
+def timelapse(path: Path, episode: Recording) -> None:
+    """Draws a row of up to five steps of an episode as PNG, as in the paper's figure 3."""
+    steps = even_steps(episode.horizon, 5)
+    figure = Figure(figsize=(2.4 * len(steps), 2.7), layout="constrained")
+    for axes, step in zip(figure.subplots(1, len(steps), squeeze=False)[0], steps, strict=True):
+        draw_step(axes, episode, step)
+        axes.set_title(f"step {step}", fontsize="medium")
+    figure.savefig(path, format="png", dpi=120)

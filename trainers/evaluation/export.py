@@ -3,7 +3,7 @@
 import json
 import logging
 import warnings
-from os import PathLike, fspath
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,10 @@ from torch.export import Dim
 from emberlink.envs.utils.atomic_io import created, new_file
 from emberlink.envs.utils.errors import UserError, require
 from emberlink.trainers.build import make_env
-from emberlink.trainers.evaluation.foreign import METADATA, foreign_name
-from emberlink.trainers.evaluation.policy import TrainedPolicy, load_policy
+from emberlink.trainers.evaluation.foreign import FOREIGN, METADATA
+from emberlink.trainers.evaluation.policy import TrainedPolicy, load
 from emberlink.trainers.evaluation.scores import LEARNED, means
 from emberlink.trainers.runs.checkpoint import read_header, versions
-from emberlink.trainers.runs.pretrained import read_run
 from emberlink.trainers.runs.run_folder import MAX_JSON, read_text
 
 MEANING = {
@@ -59,9 +58,9 @@ def export(run: str | PathLike[str], file: str | Path) -> tuple[Path, Path]:
     path = new_file(Path(file), (".onnx",))
     card_path = new_file(path.with_suffix(".json"), (".json",))
     require("onnxscript", "export", "export")
-    if foreign_name(folder := read_run(fspath(run))):
-        raise UserError(f"{folder.path}: has no networks of emberlink to export")
-    policy = load_policy(folder, device="cpu")
+    policy = load(run, device="cpu")
+    if policy.checkpoint.name == FOREIGN:
+        raise UserError(f"{run}: has no networks of emberlink to export")
     decision = Decision(policy)
     fire = torch.full(policy.config.env.grid, torch.inf)
     start = make_env(policy.config, num_envs=3, fire=fire, seed=0).reset()

@@ -1,7 +1,7 @@
 """Loads the frozen policy of a run, also for an environment with other settings."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from torchrl.envs import TensorDictPrimer
 
 from emberlink.comm.base import MODULES
 from emberlink.envs import keys
+from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.policies.hold import Held, held
@@ -27,6 +28,7 @@ from emberlink.trainers.evaluation.foreign import (
     OnnxPolicy,
     foreign_name,
     is_reference,
+    new_run,
     open_policy,
     reference_of,
 )
@@ -34,7 +36,6 @@ from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.runs.checkpoint import load_weights, read_header
 from emberlink.trainers.runs.pretrained import read_run
-from emberlink.trainers.runs.run_folder import RunFolder
 
 _CHANGEABLE = ("world", "edition", "fire", "env", "comm", "evaluation")
 """groups of keys that an evaluation can change"""
@@ -145,38 +146,46 @@ class TrainedPolicy(TensorDictSequential):
         return ", ".join(parts)
 
 
-def load_policy(
-    run: RunFolder,
+def load(
+    run: str | PathLike[str],
     overrides: Sequence[str] = (),
-    settings: Mapping[str, Any] | None = None,
     *,
-    checkpoint: Path | None = None,
+    checkpoint: str | PathLike[str] | None = None,
     device: str | None = None,
+    **settings: Any,
 ) -> TrainedPolicy:
-    """Returns the frozen policy of a run, with the configuration in its checkpoint and changes.
+    """Returns the frozen policy of a run.
 
-    Arguments as for `emberlink.trainers.load`; `overrides` are settings as texts `key=value`.
+    Args:
+        run: a run folder, or `pretrained:METHOD`.
+        overrides: settings as texts `key=value`, as for `emberlink eval`.
+        checkpoint: file of networks; the newest of the run if None.
+        device: device of the networks; the run's if None.
+        settings: `world`, settings of its fire (`"fire.path"`), or settings of `env`, `comm` or
+            `evaluation` to change, as for `train`; the networks must fit.
+
+    Raises:
+        UserError: there is no such run, a file in it is damaged, or a setting does not fit.
     """
-    folder = run.path
-    if not folder.is_dir():
-        raise UserError(f"{folder}: there is no such run folder")
-    runs = sorted(str(file.parent) for file in folder.glob("*/config.yaml"))
-    if runs and not (folder / "config.yaml").exists():
-        raise UserError(f"{folder}: a folder of {len(runs)} runs; choose one: {', '.join(runs)}")
-    name = foreign_name(run)
-    file = run.newest if checkpoint is None and not name else checkpoint
-    trained = run.config(file, **({} if device is None else {"device": device}))
-    given = {**dict(parse(text) for text in overrides), **(settings or {})}
-    config = evaluated_with(trained, given)
+    folder = read_run(fspath(run))
+    runs = sorted(str(file.parent) for file in folder.path.glob("*/config.yaml"))
+    if runs and not (folder.path / "config.yaml").exists():
+        several = f"a folder of {len(runs)} runs; choose one: {', '.join(runs)}"
+        raise UserError(f"{folder.path}: {several}")
+    name = foreign_name(folder)
+    file = None if checkpoint is None else user_path(checkpoint)
+    file = folder.newest if file is None and not name else file
+    trained = folder.config(file, **({} if device is None else {"device": device}))
+    config = evaluated_with(trained, {**dict(map(parse, overrides)), **settings})
     changed = differences(trained, config)
     if fixed := [key for key in changed if key.partition(".")[0] not in _CHANGEABLE]:
         raise UserError(
             f"{', '.join(fixed)}: an evaluation changes only keys of {', '.join(_CHANGEABLE)}"
         )
-    changes = [*overrides, *(f"{key}={shown(value)}" for key, value in (settings or {}).items())]
-    changes += [] if checkpoint is None else [checkpoint.stem]
+    changes = [*overrides, *(f"{key}={shown(value)}" for key, value in settings.items())]
+    changes += [] if checkpoint is None else [Path(checkpoint).stem]
     if file is None:
-        place = reference_of(run)
+        place = reference_of(folder)
         return foreign_policy(opened(place)[0], place, name, config, changes)
     return TrainedPolicy(load_actor(config, file), config, file, changes)
 
@@ -185,14 +194,13 @@ def opened(text: str) -> tuple[Any, str]:
     """Returns a policy given as text, a run's too, and by which text it is opened again."""
     if is_reference(text):
         return open_policy(text)
-    run = read_run(text)
-    return load_policy(run), str(run.path.absolute())
+    return load(text), str(read_run(text).path.absolute())
 
 
 def adopted(
     policy: Any, method: str, overrides: Sequence[str] = (), *, name: str = "", **settings: Any
-) -> tuple[TrainedPolicy, str]:
-    """Returns a policy for the environment of a method, and by which text it is opened again.
+) -> tuple[TrainedPolicy, Any]:
+    """Returns a policy for the environment of a method, and with a `name` its new run folder.
 
     `policy` is one of `foreign.ForeignPolicy`, or a text, see `opened`. A run, or an ONNX file of
     `emberlink export`, chooses setup, world and hold unless `overrides` or `settings` do.
@@ -205,7 +213,8 @@ def adopted(
     if usual and _card(policy)["method"] != method:
         usual = [text for text in usual if not text.startswith("comm.")]
     config = resolve(method, [*usual, *overrides], **settings)
-    return foreign_policy(policy, place, name, config), reference
+    played = foreign_policy(policy, place, name, config)
+    return played, new_run(reference, name, config) if name else None
 
 
 def foreign_policy(

@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,13 +13,11 @@ from emberlink.envs.utils.atomic_io import created, free_name, new_file
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.evaluation import episodes
 from emberlink.trainers.evaluation.episodes import Panel
-from emberlink.trainers.evaluation.policy import load_policy
+from emberlink.trainers.evaluation.policy import load
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.screen import Screen, even_steps
-from emberlink.trainers.runs.pretrained import open_run, read_run
+from emberlink.trainers.runs.pretrained import open_run
 
-_ALONE, _BESIDE = (480, 800), (360, 600)  # minimum and maximum pixels of a map's longer side
-_CELL = 8  # pixels of a cell, within those limits
 _SUFFIXES = (".gif", ".mp4", ".png", ".html")
 
 
@@ -32,20 +29,23 @@ def render(options: argparse.Namespace, console: Console) -> int:
     shown = "episode" if len(panels) == 1 else "side_by_side"
     stem = "_".join([shown, fire, str(index), *(path.stem for path in options.checkpoint)])
     paths = _free_paths(options.output, options.runs[0], stem)
-    steps = _steps(options, panels[0].config.env.horizon, paths[0])
+    horizon = panels[0].config.env.horizon
+    step = horizon if options.step is None else options.step
+    if step > horizon:
+        raise UserError(f"step={step}: the episode has the steps 0 to {horizon}")
     report = partial(console.print, style="dim", highlight=False)
     played = episodes.play_side_by_side(panels, arrival, index, report)
-    least, most = _ALONE if len(panels) == 1 else _BESIDE
-    size = options.size or min(max(_CELL * max(panels[0].config.env.grid), least), most)
+    size = options.size or (480 if len(panels) == 1 else 360)
     screen = Screen(played, size=size, grey_seen=options.seen)
     for path in paths:
         with created(path) as new:
             if path.suffix == ".html":
                 Replay(played, f"{fire}:{index}").save(new)
             elif path.suffix == ".png":
-                Image.fromarray(screen.picture(steps[0])).save(new, "PNG", optimize=True)
+                Image.fromarray(screen.picture(step)).save(new, "PNG", optimize=True)
             else:
                 write = write_gif if path.suffix == ".gif" else write_mp4
+                steps = even_steps(horizon, options.frames)
                 write(new, map(screen.picture, steps), fps=options.fps)
         console.print(str(path), soft_wrap=True, highlight=False)
     return 0
@@ -68,26 +68,11 @@ def learned(arguments: Sequence[str], checkpoints: Sequence[Path] = ()) -> Itera
         raise UserError(f"{len(checkpoints)} checkpoints for {len(runs)} runs: one each")
     titles: set[str] = set()
     for (name, changes), file in zip(runs, checkpoints or [None] * len(runs), strict=True):
-        run = read_run(name)
-        panel = load_policy(run, changes, checkpoint=file, device="cpu").panel()
+        panel = load(name, changes, checkpoint=file, device="cpu").panel()
         if panel.title in titles:  # runs that were trained with other settings
-            panel = replace(panel, title=f"{panel.title}, {run.path.name}")
+            panel = panel._replace(title=f"{panel.title}, {Path(name).name}")
         titles.add(panel.title)
         yield panel
-
-
-def _steps(options: argparse.Namespace, horizon: int, path: Path) -> list[int]:
-    """Returns the steps to draw."""
-    step = options.step
-    if path.suffix != ".png":
-        if step is None:
-            return even_steps(horizon, options.frames)
-        raise UserError(
-            f"step={step}: needs a picture, --output FILE.png; a page opens at FILE.html#t={step}"
-        )
-    if step is not None and step > horizon:
-        raise UserError(f"step={step}: the episode has the steps 0 to {horizon}")
-    return [horizon if step is None else step]
 
 
 def _free_paths(output: Path | None, run: str, stem: str) -> list[Path]:
