@@ -92,7 +92,7 @@ def read_all(
     def or_left_out(path: Path) -> Iterator[None]:
         try:
             yield
-        except (OSError, ValueError) as error:
+        except (UserError, OSError) as error:
             left_out.append((str(path), str(error)))
 
     for folder, label in sorted(folders):

@@ -21,7 +21,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.utils import get_primers_from_module
 
 from emberlink.envs import keys
-from emberlink.envs.utils.errors import UserError, require
+from emberlink.envs.utils.errors import UserError, naming, require
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.pretrained import is_name
 from emberlink.trainers.runs.run_folder import MAX_YAML, RunFolder, read_text
@@ -165,8 +165,7 @@ def new_run(reference: str, name: str, config: RunConfig) -> RunFolder:
 
 def foreign_name(run: RunFolder) -> str:
     """Returns the name of a run's policy if emberlink has not trained it, else an empty text."""
-    file = run.path / FOREIGN
-    return json.loads(read_text(file, MAX_YAML))["name"] if file.exists() else ""
+    return _read(run, "name") if (run.path / FOREIGN).exists() else ""
 
 
 def reference_of(run: RunFolder) -> str:
@@ -175,7 +174,7 @@ def reference_of(run: RunFolder) -> str:
     A folder from somebody else must not name code that came with it, so it is a whole path outside
     of the folder.
     """
-    text = json.loads(read_text(run.path / FOREIGN, MAX_YAML))["policy"]
+    text = _read(run, "policy")
     file = Path(_split(text)[0] or text)
     if not text:
         why = "its policy was an object, which cannot be opened again; file.py:NAME can"
@@ -184,6 +183,12 @@ def reference_of(run: RunFolder) -> str:
     if inside or not file.is_absolute():
         raise UserError(f"{run.path / FOREIGN}: names no policy outside of its folder: {text!r}")
     return text
+
+
+def _read(run: RunFolder, key: str) -> str:
+    file = run.path / FOREIGN
+    with naming(file, KeyError, TypeError):
+        return str(json.loads(read_text(file, MAX_YAML))[key])
 
 
 def is_reference(text: str) -> bool:
