@@ -205,7 +205,7 @@ def write_report(
         texts["marl_eval.json"] = _marl_eval(comparison)
     for name, text in texts.items():
         # Names of folders may hold bytes that are no characters.
-        (folder / name).write_text(text, errors="backslashreplace")
+        (folder / name).write_text(text, "utf-8", "backslashreplace")
     return comparison
 
 
