@@ -47,7 +47,7 @@ class FileFireConfig:
     crs: _Text | None = None
     """Projection of a file that carries none, else the target projection."""
     layer: _Text | None = None
-    """Layer of a GeoPackage or KML, or variable of a NetCDF, that has several."""
+    """Layer of a GeoPackage, or variable of a NetCDF, that has several."""
     time_field: _Text | tuple[_Text, ...] | None = None
     """Column of the perimeters' times, or the columns of the date and the time of day."""
     time_format: Annotated[str, Field(pattern=_FORMAT, max_length=100)] | None = None

@@ -1,5 +1,6 @@
 """Reads rasters of arrival times: ESRI ASCII, GeoTIFF, NetCDF, arrays of states, banks, points."""
 
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -166,7 +167,7 @@ def _opened(path: Path, kind: str, layer: str | None) -> Any:
 def _read(dataset: Any, most: int, band: int | None = None) -> np.ndarray:
     """Reads a band or all, [bands, rows, columns], of bounded size and a type of real numbers."""
     count = 1 if band else dataset.count
-    size = count * dataset.height * dataset.width
+    size = max(count * dataset.height * dataset.width, *map(math.prod, dataset.block_shapes))
     if size > most or np.dtype(dataset.dtypes[0]).kind not in "iuf":
         seen = f"{count} x {dataset.height} x {dataset.width} cells of {dataset.dtypes[0]}"
         raise ask(seen, f"{most} real numbers at most")

@@ -9,6 +9,7 @@ from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
@@ -192,7 +193,7 @@ def write_report(
     chapters = []
     for place, section in enumerate(comparison.sections, 1):
         say(f"figures of {section}")
-        chapters.append(_chapter(comparison, section, partial(saved, place)))
+        chapters.append(_chapter(comparison, section, folder, partial(saved, place)))
     page = environment.from_string(source).render(
         comparison=comparison, chapters=chapters, settings=about(), numbers=NUMBERS
     )
@@ -210,7 +211,10 @@ def write_report(
 
 
 def _chapter(
-    comparison: Comparison, section: str, saved: Callable[[Figure, str, str], dict[str, str]]
+    comparison: Comparison,
+    section: str,
+    folder: Path,
+    saved: Callable[[Figure, str, str], dict[str, str]],
 ) -> dict[str, Any]:
     """Draws the figures of a section, and returns its part of the page."""
     runs, ranking, curves = (
@@ -235,7 +239,7 @@ def _chapter(
         "frozen": frozen,
         "tables": tables(comparison, section),
         "training": training,
-        "details": _details(runs),
+        "details": _details(runs, folder),
     }
 
 
@@ -270,7 +274,7 @@ def _marl_eval(comparison: Comparison) -> str:
     return json.dumps({"emberlink": tasks}) + "\n"
 
 
-def _details(runs: Frame) -> list[Table]:
+def _details(runs: Frame, folder: Path) -> list[Table]:
     """Returns the settings in which the labels of a section differ, and its runs."""
     settings = differing(runs).rename_axis("policy").reset_index()
     trained = runs[runs["as_trained"]]
@@ -278,7 +282,10 @@ def _details(runs: Frame) -> list[Table]:
     rows["episodes of training"] = [len(run.lines) for run in trained["object"]]
     rows["folder"] = trained["run"]
     pages = [Path(run) / "figures" / "replay.html" for run in trained["run"]]
-    rows["replay"] = [page.resolve().as_uri() if page.is_file() else "" for page in pages]
+    start = folder.resolve()
+    rows["replay"] = [
+        quote(os.path.relpath(page.resolve(), start)) if page.is_file() else "" for page in pages
+    ]
     return [
         Table("Settings that differ", "", settings.astype(str)),
         Table("Runs", "", rows.astype(str)),
