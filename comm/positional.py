@@ -78,7 +78,7 @@ class Positional(CommModule):
         joined = torch.where(hears.unsqueeze(-1), heard.unsqueeze(-3), 0.0)
         joined = torch.where(self._own.unsqueeze(-1), vectors.unsqueeze(-3), joined)
         if self.config.own_first:
-            joined = joined.take_along_dim(self._order, -2)
+            joined = joined.gather(-2, self._order.expand_as(joined))
         return tensordict.set(keys.OBSERVATION, joined.flatten(-2))
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:

@@ -150,7 +150,6 @@ def test_render_writes_a_page_of_several_runs(tmp_path, capsys):
     assert [row[0] for row in with_radio["position"]] == [row[0] for row in without["position"]]
     assert "1" in "".join(with_radio["hears"])
     assert "1" not in "".join(without["hears"])
-    refused(["render", run, "--output", tmp_path / "b.html", "--step", 3], capsys, "#t=3")
     refused(["render", "env.radio.range=0", run], capsys, "after the run")
 
 

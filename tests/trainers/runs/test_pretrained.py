@@ -13,7 +13,6 @@ import yaml
 from refusal import refused
 from tiny_run import TINY
 
-from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import flat, to_values
 from emberlink.trainers.evaluation.policy import load_actor
@@ -57,7 +56,7 @@ def test_seeds_are_added_to_an_archive(packed, tmp_path):
     names = [f"arm/s{seed}/{file}" for seed in (1, 3) for file in FILES]
     assert [sorted(content) for content in read] == [names[2:], names]
     assert read[1].items() >= read[0].items()
-    with pytest.raises(UserError, match="s3: exists already"):
+    with pytest.raises(FileExistsError):
         packed_in(str(packed[1][0]), str(archive))
 
 
