@@ -30,7 +30,7 @@ class Stateful(TensorDictModuleBase):
         reads, writes: its other keys.
     """
 
-    def __init__(self, uavs: int, carries: dict[Key, int], reads: Sequence[Any], writes: list[Any]):
+    def __init__(self, uavs: int, carries: dict[Any, int], reads: Sequence[Any], writes: list[Any]):
         super().__init__()
         self.uavs, self.carries = uavs, carries
         state: list[Any] = [keys.STEP, *carries] if carries else []
