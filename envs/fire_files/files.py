@@ -122,5 +122,5 @@ def digest(files: Iterable[str]) -> str:
             mains = members(path) if path.is_dir() else [path]
             for part in [part for main in mains for part in (main, *_beside(main))]:
                 with open_regular(part, 2**63) as opened:
-                    content.update(hashlib.file_digest(opened, "sha256").digest())
+                    content.update(hashlib.file_digest(opened, "sha256").digest())  # pyright: ignore
     return content.hexdigest()
