@@ -37,7 +37,7 @@ class FileFireConfig:
     end: _Time | None = None
     """Time of the last step, as `start`; the last arrival if None."""
     minutes_per_step: Annotated[float, Field(gt=0, le=1e9)] | None = None
-    """Minutes of the fire per step of the episode; takes the place of `end`."""
+    """Minutes of the fire per step of the episode, instead of `end`."""
     margin: Annotated[float, Field(ge=0, le=0.45)] | None = 0.1
     """Part of the grid left free on each side of the burnt area; None takes the file's extent."""
     ring_width: Annotated[float, Field(gt=0, le=30)] | None = 3.0

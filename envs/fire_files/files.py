@@ -54,7 +54,7 @@ def named(file: str, layer: str | None = None) -> Iterator[Path]:
     except UserError as error:
         raise UserError(printable(f"{place}: {error}")) from None
     except OSError as error:
-        raise UserError(printable(f"{place}: {error.strerror}")) from None
+        raise UserError(printable(f"{place}: {error.strerror or error}")) from None
 
 
 @contextmanager
@@ -78,7 +78,7 @@ def find_format(path: Path) -> str:
         raise ask(f"{size} bytes", f"a text file of at most {MAX_BYTES}")
     # To GDAL, shapes that are cut off are empty. The seventh number of the header is the length.
     if kind == "shp" and size < (told := 2 * int(np.fromfile(path, ">i4", 7)[-1])):
-        raise ask(f"it is damaged: {size} bytes", f"{told} bytes")
+        raise ask(f"{path.name} is damaged: {size} bytes", f"{told} bytes")
     for part in _beside(path):
         # GDAL opens masks and overviews in any format; some formats read other addresses.
         if part.suffix.lower() in (".msk", ".ovr") and _format(part) != "tif":
@@ -121,6 +121,7 @@ def digest(files: Iterable[str]) -> str:
         with named(file) as path:
             mains = members(path) if path.is_dir() else [path]
             for part in [part for main in mains for part in (main, *_beside(main))]:
+                content.update(part.name.removeprefix(path.stem).encode())  # it may hold a date
                 with open_regular(part, 2**63) as opened:
                     content.update(hashlib.file_digest(opened, "sha256").digest())  # pyright: ignore
     return content.hexdigest()

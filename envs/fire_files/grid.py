@@ -65,6 +65,8 @@ def _span(fire: "Raster | Perimeters", config: FileFireConfig, horizon: int) -> 
     start = clock.beginning(fire.first, fire.last) if start is None else start
     end = fire.last if end is None else end
     if steps is not None:
+        if config.end is not None:
+            raise ask("fire.end and fire.minutes_per_step", "one of them")
         if clock.unit not in SECONDS:
             raise ask(f"fire.minutes_per_step: times are in {clock.unit}", "fire.units")
         end = start + horizon * steps * 60 / SECONDS[clock.unit]

@@ -59,7 +59,8 @@ class Raster:
         else:
             burnt = self.times <= until
             if burnt.sum() < 2:
-                raise UserError(f"until {self.clock.format(until)} no fire spreads: a single cell")
+                ends = map(self.clock.format, (until, self.first, self.last))
+                raise UserError("until {} no fire spreads; it burns from {} to {}".format(*ends))
             inner: Any = binary_erosion(burnt)
             at = np.stack(np.nonzero(burnt & ~inner))
             # Along each axis, the front has passed the centre by less than a cell.
@@ -170,7 +171,7 @@ def _read(dataset: Any, most: int, band: int | None = None) -> np.ndarray:
     size = max(count * dataset.height * dataset.width, *map(math.prod, dataset.block_shapes))
     if size > most or np.dtype(dataset.dtypes[0]).kind not in "iuf":
         seen = f"{count} x {dataset.height} x {dataset.width} cells of {dataset.dtypes[0]}"
-        raise ask(seen, f"{most} real numbers at most")
+        raise ask(f"{seen}, in blocks of {dataset.block_shapes[0]}", f"{most} real numbers at most")
     return dataset.read([band] if band else None)
 
 

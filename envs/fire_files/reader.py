@@ -21,6 +21,8 @@ from emberlink.envs.fire_files.report import Report
 from emberlink.envs.utils.atomic_io import write_bytes
 from emberlink.envs.utils.errors import UserError, naming, printable
 
+_OF_TABLES = ("time_field", "time_format", "incident", "incident_field", "where", "radius")
+
 
 def read_with_summary(
     config: FileFireConfig, grid: tuple[int, int], horizon: int
@@ -32,6 +34,9 @@ def read_with_summary(
     report = Report()
     with named(config.path, config.layer) as path:
         kind = find_format(path)
+        for key in ("unburned",) if kind in TABLES else _OF_TABLES:
+            if getattr(config, key) is not None:
+                raise UserError(f"fire.{key} has no effect on files of this kind")
         if kind in TABLES:
             from emberlink.envs.fire_files.perimeters import read_perimeters
 
@@ -84,10 +89,11 @@ def _divide(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[
 
 def with_checksum(config: FileFireConfig) -> FileFireConfig:
     """Computes the checksum of the files and returns the scenario with it."""
-    now, known = digest(filter(None, (config.path, config.test))), config.sha256
+    files = [*filter(None, (config.path, config.test))]
+    now, known = digest(files), config.sha256
     if known not in (None, now):
-        seen = f"its SHA-256 is {now[:12]}..., in the run {known[:12]}..."
-        raise UserError(f"{config.path}: has changed: {seen}")
+        seen = f"the SHA-256 is {now[:12]}..., in the run {known[:12]}..."
+        raise UserError(f"{printable(' or '.join(files))}: has changed: {seen}")
     return dataclasses.replace(config, sha256=now)
 
 

@@ -96,7 +96,9 @@ def _geojson(path: Path, _: str | None) -> Any:
     features = [whole] if whole.get("type") == "Feature" else whole["features"]
     crs: Any = _DEGREES
     if given := whole.get("crs"):
-        crs = given["properties"]["name"]  # a link is not followed
+        if given.get("type") != "name":
+            raise ask("its crs is a link, which is not followed", "a name, or none")
+        crs = given["properties"]["name"]
     for shape in (feature.get("geometry") or {} for feature in features):
         if shape.get("type") == "Polygon":  # shapely reads arrays twice as fast
             shape["coordinates"] = [np.array(ring) for ring in shape["coordinates"]]

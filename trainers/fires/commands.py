@@ -3,6 +3,7 @@
 import io
 import os
 import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -48,7 +49,7 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
     if path is None:
         stem = re.sub(r"[^\w.+-]", "-", f"fire_{Path(name).stem}_{index}")[:100]
         path = Path(f"{free_name(output or Path(), stem, ['.png'])}.png")
-    with created(path) as partial:
+    with created(path) as partial, warnings.catch_warnings(action="ignore"):  # of missing letters
         arrival_figure(partial, arrival, world.horizon, shown(title))
     grid = " x ".join(map(str, world.grid))
     first = f"{shown(title)}: {grid} cells, {world.horizon} steps, setup {config.setup}"

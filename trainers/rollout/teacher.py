@@ -26,7 +26,6 @@ class KnownMaps:
         maps: the maps of the environment's communication.
     """
 
-    sends = True
     reach: Tensor
 
     def __init__(self, maps: BeliefMaps):

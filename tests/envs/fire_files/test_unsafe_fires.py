@@ -138,7 +138,7 @@ def test_links_declarations_and_sizes_in_texts_are_refused(tmp_path, wholes):
     rows = wholes[".asc"].read_text()
     for name, text, match in (
         ("fire.asc", rows.replace("NCOLS 40", "NCOLS 1000000000"), "40 x 1000000000|expected"),
-        ("fire.json", json.dumps({**whole, "crs": link}), "fire.json: 'name'; expected perimeters"),
+        ("fire.json", json.dumps({**whole, "crs": link}), "crs is a link, which is not followed"),
         ("fire.kml", f'<!DOCTYPE kml [<!ENTITY z0 "zz">{bomb}]><kml>&z9;</kml>', "amplification"),
     ):
         (tmp_path / name).write_text(text)
