@@ -50,6 +50,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _report(program, str(error))
     except OSError as error:
         return _report(program, f"{error.filename or 'a file'}: {error.strerror or error}")
+    except RuntimeError as error:
+        # PyTorch has no error class for memory of the CPU.
+        if "DefaultCPUAllocator" in str(error) or type(error).__name__ == "OutOfMemoryError":
+            return _report(program, f"not enough memory: {str(error).splitlines()[0]}")
+        raise
 
 
 def _report(program: str, message: str, status: int = 2) -> int:

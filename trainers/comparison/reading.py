@@ -1,7 +1,4 @@
-"""Finds finished runs on disk and reads them.
-
-A configuration is read as plain values, so that runs of earlier versions stay readable.
-"""
+"""Finds finished runs on disk and reads them, their configurations as plain values."""
 
 import json
 import shlex
@@ -84,7 +81,7 @@ def read_all(
     if labels and len(labels) != len(paths):
         raise UserError(f"{len(labels)} labels for {len(paths)} paths: one each")
     named = zip(paths, labels or [""] * len(paths), strict=True)
-    folders = [(folder, label) for path, label in named for folder in find(path)]
+    folders = {each.resolve(): (each, label) for path, label in named for each in find(path)}
     runs: list[Run] = []
     left_out: list[LeftOut] = []
 
@@ -94,8 +91,10 @@ def read_all(
             yield
         except (UserError, OSError) as error:
             left_out.append((str(path), str(error)))
+        except KeyError as error:
+            left_out.append((str(path), f"{error} is missing in its files"))
 
-    for folder, label in sorted(folders):
+    for folder, label in sorted(folders.values()):
         with or_left_out(folder):
             run = read(folder)
             runs.append(run := replace(run, name=label or run.name))

@@ -284,7 +284,8 @@ def _details(runs: Frame, folder: Path) -> list[Table]:
     pages = [Path(run) / "figures" / "replay.html" for run in trained["run"]]
     start = folder.resolve()
     rows["replay"] = [
-        quote(os.path.relpath(page.resolve(), start)) if page.is_file() else "" for page in pages
+        quote(os.fsencode(os.path.relpath(page.resolve(), start))) if page.is_file() else ""
+        for page in pages
     ]
     return [
         Table("Settings that differ", "", settings.astype(str)),

@@ -82,6 +82,8 @@ def combinations(arguments: Sequence[str]) -> list[Combination]:
     methods = [text for text in arguments if "=" not in text] or list(known("method"))
     choices = [_values(text) for text in arguments if "=" in text]
     several = {_key(texts[0]) for texts in choices if len(texts) > 1}
+    if "output" in several:
+        raise UserError("output: a sweep has one output folder")
     found: dict[str, Combination] = {}
     for method, overrides in product(methods, product(*choices)):
         config = resolve(method, overrides)
