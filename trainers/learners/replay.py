@@ -1,5 +1,6 @@
 """Stores the UAVs' transitions, per UAV or shared by all (paper, sections IV.C and IV.D)."""
 
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -47,6 +48,7 @@ class TeamReplay:
         """rows that hold a full batch"""
         self.written = 0
         """rows written so far, including overwritten ones"""
+        logging.getLogger("torchrl").addFilter(_tells_no_storage)
         self._buffer = ReplayBuffer(
             storage=LazyTensorStorage(self.capacity, device=context.device),
             sampler=UavSampler(uavs, generator, shared=shared and mixed, joint=joint),
@@ -118,6 +120,10 @@ class UavSampler(RandomSampler):
         size = count, 1 if self.joint else len(self.own)
         drawn = torch.randint(limit, size, generator=self.generator, device=self.own.device)
         return drawn.expand(-1, len(self.own))
+
+
+def _tells_no_storage(record: logging.LogRecord) -> bool:
+    return "Initialized LazyTensorStorage" not in str(record.msg)  # at each training's first row
 
 
 def to_rows(rollout: TensorDictBase, context: LearnerContext) -> TensorDict:
