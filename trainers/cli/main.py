@@ -7,6 +7,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from importlib.metadata import version
 
 from emberlink.envs.utils.errors import UserError, one_line, unknown
@@ -14,8 +15,6 @@ from emberlink.trainers.cli import commands as of
 from emberlink.trainers.cli.fire import add_fire
 from emberlink.trainers.cli.list import add_list
 from emberlink.trainers.cli.parser import Parser
-
-_formatwarning, _printed = warnings.formatwarning, set[str]()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -27,7 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _report("emberlink", "runs on Linux and macOS; on Windows, use WSL")
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # for characters that the encoding lacks
-    warnings.formatwarning = _on_one_line
+    printed: set[str] = set()
+    warnings.formatwarning = partial(_on_one_line, warnings.formatwarning, printed)
     words = list(sys.argv[1:] if arguments is None else arguments)
     parser, names = _parser()
     if not words:
@@ -80,11 +80,11 @@ def _parser() -> tuple[Parser, list[str]]:
     return parser, list(commands.choices)
 
 
-def _on_one_line(message, category, *place) -> str:
+def _on_one_line(otherwise, printed: set[str], message, category, *place) -> str:
     """Formats a `UserWarning` as `emberlink: warning: ...`, or as nothing if it was printed."""
     if not issubclass(category, UserWarning):
-        return _formatwarning(message, category, *place)
+        return otherwise(message, category, *place)
     text = one_line(str(message))
-    line = "" if text in _printed else f"emberlink: warning: {text}\n"
-    _printed.add(text)
+    line = "" if text in printed else f"emberlink: warning: {text}\n"
+    printed.add(text)
     return line
