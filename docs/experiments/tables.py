@@ -26,6 +26,7 @@ from matplotlib.figure import Figure
 
 from emberlink.envs import metrics
 from emberlink.trainers.comparison import bootstrap, drawing, rankings
+from emberlink.trainers.comparison.communication import gain_and_value
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "docs" / "data"
@@ -69,15 +70,22 @@ def computed(expression: str) -> Any:
 
 
 def cell(row: str, column: str) -> str:
-    """Returns the text of an expression; empty if its runs do not exist."""
+    """Returns the text of an expression; empty if its runs do not exist.
+
+    * marks what was computed of fewer than 5 seeds.
+    """
     expression = row.replace("{}", column) if "{}" in row else column.replace("{}", row)
+    function, *runs, measure, digits = expression.split()
     value, ends = computed(expression) or (None, None)
     if value is None or np.isnan(value):
         return "" if value is None else "undetermined"
-    digits = int(expression.split()[-1])
-    numbers = [round(x, digits) + 0.0 for x in (value, *(ends or ()))]
+    numbers = [round(x, int(digits)) + 0.0 for x in (value, *(ends or ()))]
     texts = [f"{x:,.{digits}f}".replace("-", "\N{MINUS SIGN}") for x in numbers]
-    return f"{texts[0]} [{texts[1]}, {texts[2]}]" if ends and ends[0] < ends[1] else texts[0]
+    if not ends or ends[0] == ends[1]:
+        return texts[0]
+    few = any(1 < len(sample(*run.split("/"), measure)) < bootstrap.FEW for run in runs)
+    few &= function in ("gain", "ratio", "value")
+    return f"{texts[0]} [{texts[1]}, {texts[2]}]{'*' * few}"
 
 
 @cache
@@ -102,35 +110,11 @@ def iqm(samples: Any, _: str, run: int = 0, last: int = 0, seeds: int | None = N
     return bootstrap.iqm(means), bootstrap.interval(bootstrap.iqm, means)
 
 
-def gain(samples: Any, _: str) -> Any:
-    """Returns by how much trainings exceed others, with an interval over seeds and fires."""
-    value = bootstrap.iqm_difference(*(sample.mean(1) for sample in samples[:2]))
-    return value, bootstrap.crossed_interval(bootstrap.iqm_difference, *samples[:2])
-
-
-def same(samples: Any, _: str) -> Any:
-    """Returns by how much networks exceed themselves otherwise, with an interval over fires."""
-    fires = samples[0].shape[1]
-    generator = np.random.default_rng(bootstrap.BOOTSTRAP_SEED)
-    drawn = generator.multinomial(fires, [1 / fires] * fires, bootstrap.RESAMPLES)
-    share = np.vstack([np.ones(fires), drawn]).T / fires
-    value, *resampled = bootstrap.iqm_difference(*(x @ share for x in samples[:2]), axis=0)
-    return value, [*np.quantile(resampled, [0.025, 0.975])]
-
-
-def value(samples: Any, _: str) -> Any:
-    """Returns (arm - none) / (full - none) with its interval, NaN unless full - none is above 0."""
-
-    def share(none: Any, arm: Any, full: Any, axis: int = -1) -> Any:
-        gains = [bootstrap.iqm_difference(sample, none, axis) for sample in (arm, full)]
-        return gains[0] / gains[1]
-
-    none, _, full = samples
-    most = bootstrap.crossed_interval(bootstrap.iqm_difference, full, none)
-    if most is None or most[0] <= 0:
-        return np.nan, None
-    means = (sample.mean(1) for sample in samples)
-    return share(*means), bootstrap.crossed_interval(share, *samples)
+def gain(samples: Any, measure: str, key: str = "gain", retrained: bool = True) -> Any:
+    """Returns a number of `gain_and_value` and its interval, NaN if it is undetermined."""
+    now = gain_and_value(measure, samples[:2][::-1] + samples[2:], retrained=retrained)
+    ends = now.get(f"{key}_low"), now.get(f"{key}_high")
+    return now.get(key, np.nan), None if None in ends else ends
 
 
 def rise(samples: Any, _: str) -> Any:
@@ -147,9 +131,10 @@ def ratio(samples: Any, measure: str) -> Any:
 
 
 FUNCTIONS: dict[str, Any] = {
-    **{"iqm": iqm, "gain": gain, "same": same, "ratio": ratio, "last10": partial(iqm, last=2)},
+    **{"iqm": iqm, "gain": gain, "ratio": ratio, "last10": partial(iqm, last=2)},
+    **{"same": partial(gain, retrained=False), "value": partial(gain, key="value")},
     **{f"run{i}": lambda samples, _, i=i: (iqm(samples, _, i)[0], None) for i in range(3)},
-    **{"value": value, "rise": rise, "seed0": partial(iqm, seeds=1)},
+    **{"rise": rise, "seed0": partial(iqm, seeds=1)},
     "p": lambda samples, _: (bootstrap.crossed_p(bootstrap.iqm_difference, *samples), None),
     "seeds": lambda samples, _: (len(samples[0]), None),
 }

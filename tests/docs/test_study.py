@@ -48,10 +48,10 @@ def test_the_numbers_of_the_study_by_hand():
     """50, 60 and 75 on each fire, with little spread over the seeds."""
     spread = np.array([[0.0], [0.1], [0.2], [0.3], [0.4]])
     none, some, full = (np.full((5, 4), x) + spread for x in (50, 60, 75))
-    value, ends = tables.value([none, some, full], "")
+    value, ends = tables.gain([some, none, full], "coverage", "value")
     assert value == pytest.approx(0.4)
     assert 0.3 < ends[0] < 0.4 < ends[1] < 0.5
-    assert np.isnan(tables.value([none, some, none], "")[0])
+    assert np.isnan(tables.gain([some, none, none], "coverage", "value")[0])
     assert tables.rise([np.array([[0] * 12 + [10, 20, 30, 60]])], "")[0] == 45 - 15
 
 

@@ -109,18 +109,20 @@ def interval(
     return _finite(ends)
 
 
-def crossed_interval(statistic: Callable[..., Any], *samples: Values) -> Interval | None:
+def crossed_interval(
+    statistic: Callable[..., Any], *samples: Values, seeds: bool = True
+) -> Interval | None:
     """Returns the 95 % interval of a statistic of trainings, over their seeds and the fires.
 
     `samples` are [seeds, fires] for each training. Each resample draws fires, the same for all, and
-    seeds within each; a run's number is its mean over the drawn fires. Intervals over fires alone
-    describe the networks at hand; this one describes another training on other fires. None if a
-    training has only one seed, or an end is not finite.
+    seeds within each; a run's number is its mean over the drawn fires. This interval describes
+    another training on other fires; one over fires alone, without `seeds`, the networks at hand.
+    None if there is only one fire or, for `seeds`, one seed, or an end is not finite.
     """
-    if min(map(len, samples)) < 2:
+    if min(sample.shape[not seeds] for sample in samples) < 2:
         return None
     tail = (1 - LEVEL) / 2
-    return _finite(np.quantile(_crossed(statistic, samples), [tail, 1 - tail]))
+    return _finite(np.quantile(_crossed(statistic, samples, seeds), [tail, 1 - tail]))
 
 
 def crossed_p(statistic: Callable[..., Any], *samples: Values) -> float | None:
@@ -142,15 +144,19 @@ def holm(values: Sequence[float]) -> list[float]:
     return corrected.tolist()
 
 
-def _crossed(statistic: Callable[..., Any], samples: Sequence[Values]) -> Values:
-    """Returns a statistic of resamples of seeds and fires, see `crossed_interval`."""
+def _crossed(
+    statistic: Callable[..., Any], samples: Sequence[Values], seeds: bool = True
+) -> Values:
+    """Returns a statistic of resamples of fires and, if wanted, seeds, see `crossed_interval`."""
     generator = np.random.default_rng(BOOTSTRAP_SEED)
     fires = samples[0].shape[1]
     share = generator.multinomial(fires, [1 / fires] * fires, RESAMPLES).T / fires
     drawn: list[Values] = []
     for sample in samples:
-        seeds = generator.integers(len(sample), size=(len(sample), RESAMPLES))
-        drawn.append(np.take_along_axis(sample @ share, seeds, axis=0))
+        drawn.append(sample @ share)
+        if seeds:
+            rows = generator.integers(len(sample), size=(len(sample), RESAMPLES))
+            drawn[-1] = np.take_along_axis(drawn[-1], rows, axis=0)
     return statistic(*drawn, axis=0)
 
 

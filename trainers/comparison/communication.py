@@ -1,6 +1,7 @@
 """Computes the gain of messages and the value of communication: how much of the gain is reached."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -29,9 +30,9 @@ COLUMNS = (
 )
 """columns of `communication_values`. `radios` is "evaluated" if the same networks were evaluated
 with other radios, "retrained" if other networks were trained with them, "scripted" for a scripted
-policy. `none`, `with_radio` and `full` are means with the radio off, with the world's radio and
-without limits; `gain` is with_radio - none, `value` is gain / (full - none), missing where the
-interval of full - none is not above 0 (below, if less is better)."""
+policy. `none`, `with_radio` and `full` are interquartile means over seeds with the radio off, with
+the world's radio and without limits; `gain` is with_radio - none, `value` is gain / (full - none),
+missing where the interval of full - none is not above 0 (below, if less is better)."""
 
 Group = list[Run]
 """the runs of a label"""
@@ -114,33 +115,21 @@ def _world(run: Run) -> dict[str, Any]:
 
 def gain_and_value(measure: str, samples: Sequence[Values], *, retrained: bool) -> dict[str, Any]:
     """Returns the numbers of samples [seeds, fires]: radio off, the world's and maybe no limits."""
-    means = [sample.mean(0) for sample in samples]
-
-    def ends(statistic: Callable[..., Any], *places: int) -> tuple[Any, Any]:
-        if retrained:
-            found = bootstrap.crossed_interval(statistic, *(samples[i] for i in places))
-        else:
-            found = bootstrap.interval(statistic, *(means[i] for i in places), paired=True)
-        return found or (None, None)
-
-    none, with_radio, *rest = (float(mean.mean()) for mean in means)
-    row: dict[str, Any] = {"none": none, "with_radio": with_radio, "gain": with_radio - none}
-    row["gain_low"], row["gain_high"] = ends(_gain, 0, 1)
-    for full in rest:
-        row["full"] = full
-        low, high = ends(_gain, 0, 2)
-        if low is not None and (low > 0 if measure in metrics.HIGHER_IS_BETTER else high < 0):
-            row["value"] = (with_radio - none) / (full - none)
-            row["value_low"], row["value_high"] = ends(_share, 0, 1, 2)
+    means = [sample.mean(1) for sample in samples]
+    ends = partial(bootstrap.crossed_interval, seeds=retrained)
+    row = dict(zip(("none", "with_radio", "full"), map(bootstrap.iqm, means), strict=False))
+    row["gain"] = bootstrap.iqm_difference(means[1], means[0])
+    low_high = ends(bootstrap.iqm_difference, samples[1], samples[0])
+    row["gain_low"], row["gain_high"] = low_high or (None, None)
+    for full in samples[2:]:
+        low, high = ends(bootstrap.iqm_difference, full, samples[0]) or (0, 0)
+        if low > 0 if measure in metrics.HIGHER_IS_BETTER else high < 0:
+            row["value"] = float(_share(*means))
+            row["value_low"], row["value_high"] = ends(_share, *samples) or (None, None)
     return row
 
 
-def _gain(none: Values, with_radio: Values, axis: int = -1) -> Any:
-    """Returns with_radio - none of the means along an axis."""
-    return with_radio.mean(axis) - none.mean(axis)
-
-
 def _share(none: Values, with_radio: Values, full: Values, axis: int = -1) -> Any:
-    """Returns (with_radio - none) / (full - none) of the means along an axis; NaN for x / 0."""
-    gained, most = (_gain(none, m, axis) for m in (with_radio, full))
+    """Returns (with_radio - none) / (full - none) of interquartile means; NaN for x / 0."""
+    gained, most = (bootstrap.iqm_difference(x, none, axis) for x in (with_radio, full))
     return np.divide(gained, most, out=np.full_like(gained, np.nan), where=most != 0)
