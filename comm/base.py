@@ -272,7 +272,7 @@ class Communication(Transform):
             step, world = steps.get(keys.STEP), self.module.world
             at = steps.get(keys.POSITION), steps.get(keys.RNG_KEY), step
             near, hears = self.channel(*at, steps.get(keys.ALIVE) if world.failures else None)
-            left = radio.budget(world.radio, near)
+            left = radio.budget(world, near)
             if left is not None:
                 decides = step.unsqueeze(-1) % self.module.hold == 0
                 left = left - self.message_bytes * decides

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from emberlink.envs.config import RadioConfig
 from emberlink.envs.world.coverage_map import View, mark, own_maps
 from emberlink.envs.world.knowledge import Knowledge
-from emberlink.envs.world.radio import Late, budget
+from emberlink.envs.world.radio import Late
 
 OLD = 100
 """largest gain of an entry for one hearer, steps"""
@@ -293,15 +293,15 @@ def share(
     exchange: Exchange | None,
     view: View,
     step: Tensor,
-    near: Tensor,
     hears: Tensor,
+    left: Tensor | None,
 ) -> Tensor | None:
     """Adds the sightings and messages of a step to maps; at once and along any path without limits.
 
     Args:
         view: the cells in view.
-        near, hears: bool [envs, r, r], the links of a step without and with losses.
         step: int64 [envs], steps since the episode began.
+        hears, left: see `Exchange.forward`.
 
     Returns:
         The bytes that each radio says, int64 [envs, r]; None without an exchange.
@@ -311,7 +311,7 @@ def share(
         return None
     known.see(view, step.view(-1, 1, 1))
     exchange.saw(view)
-    sent, arrives, _ = exchange(known, hears, step, budget(exchange.config, near))
+    sent, arrives, _ = exchange(known, hears, step, left)
     known.reach.copy_(arrives).diagonal(dim1=1, dim2=2).fill_(True)
     return sent
 

@@ -11,7 +11,7 @@ from emberlink.envs.config import WildfireConfig
 from emberlink.envs.world.coverage_map import CoverageMap, Look, View
 from emberlink.envs.world.exchange import Exchange, cell_bytes, share
 from emberlink.envs.world.knowledge import Knowledge, step_type
-from emberlink.envs.world.radio import Channel
+from emberlink.envs.world.radio import Channel, budget
 
 _EXACT = 512
 """ages below are counted one by one"""
@@ -258,7 +258,9 @@ class Measures(nn.Module):
         assert ages is not None
         assert knowledge.seen_fire is not None
         before = knowledge.last_seen[:, -1].clone()
-        sent = share(knowledge, self.reports, view, step, *links)
+        near, hears = links
+        left = budget(self._world, near)
+        sent = share(knowledge, self.reports, view, step, hears, left)
         after, now = knowledge.last_seen[:, -1].clone(), step.unsqueeze(-1)
         arrival, burn_out = times
         newer = (after > before) & (after > ages.since) & (arrival <= now)

@@ -154,16 +154,19 @@ def fade(far: Tensor) -> Tensor:
     return torch.sigmoid(_STEEP * (far / _HALF).log())
 
 
-def budget(config: RadioConfig, near: Tensor) -> Tensor | None:
+def budget(world: WildfireConfig, near: Tensor) -> Tensor | None:
     """Returns the bytes that each radio can say in a step, int64 [..., r]; None for no limit.
+
+    In a world with a base, half of them are for messages, and half for reports to the base.
 
     Args:
         near: bool [..., r, r], the links if no message is lost.
     """
+    config = world.radio
     if config.bandwidth is None:
         return None
     sharing = 1 + near.sum(-1) if config.shared else near.new_ones(near.shape[:-1]).long()
-    return config.bandwidth // sharing
+    return config.bandwidth // (sharing * (1 + (world.base is not None)))
 
 
 def reachable(hears: Tensor) -> Tensor:

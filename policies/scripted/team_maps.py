@@ -12,7 +12,7 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.exchange import Exchange, cell_bytes, share, step_bytes
 from emberlink.envs.world.knowledge import Knowledge
-from emberlink.envs.world.radio import Channel
+from emberlink.envs.world.radio import Channel, budget
 from emberlink.envs.world.sensor import Sensor
 
 TARGET_BYTES = 8
@@ -85,8 +85,9 @@ class TeamMaps(nn.Module):
         cells = torch.cat((cells, self._own), -1)
         in_view = torch.nn.functional.pad(in_view, (0, 1), value=True)
         in_view &= (alive & ~begins.unsqueeze(-1)).unsqueeze(-1)
-        links = self.channel(position, *given, alive)
-        self.sent = share(self.known, self.exchange, View(cells, in_view, in_view), step, *links)
+        near, hears = self.channel(position, *given, alive)
+        view, left = View(cells, in_view, in_view), budget(self._world, near)
+        self.sent = share(self.known, self.exchange, view, step, hears, left)
         self.reach.copy_(self.known.reach)
         if self._world.radio.delay:
             self.reach.zero_()

@@ -9,12 +9,14 @@ from hypothesis import strategies as st
 from scalar_exchange import ScalarExchange
 
 from emberlink.envs.config import RadioConfig, WildfireConfig
+from emberlink.envs.keys import BYTES_SENT
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.exchange import Exchange, cell_bytes
 from emberlink.envs.world.knowledge import Knowledge
 from emberlink.envs.world.radio import Channel, Late, budget
+from emberlink.trainers import make_env
 
 RADIO = {
     "range": st.sampled_from([0.0, 6.0, 12.0, math.inf]),
@@ -129,7 +131,7 @@ def test_messages_equal_plain_python_one_by_one(seed, unit, **radio):
         exchange.saw(view)
         position = draw(step // 9 + seed, ENVS, UAVS, 3).double() * 12
         near, hears = channel(position, keys, now)
-        left = budget(config, near)
+        left = budget(world, near)
         sent, arrives, _ = exchange(known, hears, now, left)
         for e, scalar in enumerate(scalars):
             for uav in range(UAVS):
@@ -148,3 +150,12 @@ def test_messages_equal_plain_python_one_by_one(seed, unit, **radio):
                 )
                 held = {c: look for c, look in enumerate(looks) if look[0] >= 0}
                 assert held == scalar.known[uav]
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("method", ["maps", "positional", "consensus"])
+def test_messages_and_reports_share_the_bytes_of_a_step(method, shared):
+    limits = {"env.radio.bandwidth": 64, "env.radio.shared": shared, "env.radio.range": 12.0}
+    env = make_env(method, num_envs=4, setup="strong", world="relay", **limits)
+    sent = env.rollout(40)["next", *BYTES_SENT]
+    assert (32 if method == "maps" and not shared else 0) < sent.max() <= 64
