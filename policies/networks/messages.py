@@ -68,8 +68,8 @@ class Messages(nn.Module):
                 (column).
         """
         message, key = self.arrive(message), self.arrive(key)
-        weights = self.weights(features, key, hears).to(message.dtype)
-        return self.grouping.split(weights @ message, hears.shape[:2])
+        weights = self.weights(features, key, hears) * hears
+        return self.grouping.split(weights.to(message.dtype) @ message, hears.shape[:2])
 
     def arrive(self, said: Tensor) -> Tensor:
         """Returns numbers that UAVs say, [envs, uavs, numbers], as others hear them: see `fault`.
@@ -86,7 +86,7 @@ class Messages(nn.Module):
     def weights(self, features: Tensor, key: Tensor, hears: Tensor) -> Tensor:
         """Returns the weight of each message (column) for a UAV (row), [envs, uavs, uavs].
 
-        It must be 0 where no message is heard.
+        Weights of messages that are not heard have no effect.
 
         Args:
             features, hears: see `forward`.
@@ -118,7 +118,7 @@ class Attention(Messages):
         query = self.grouping.join(self.query(features), hears.shape[:2])
         scores = (query @ key.mT / math.sqrt(self.key_size)).masked_fill(~hears, -torch.inf)
         # A UAV that hears nobody has no softmax.
-        return scores.masked_fill(~hears.any(-1, keepdim=True), 0.0).softmax(-1) * hears
+        return scores.masked_fill(~hears.any(-1, keepdim=True), 0.0).softmax(-1)
 
 
 def eight_bits(x: Tensor) -> Tensor:

@@ -252,6 +252,14 @@ def test_bytes_are_sent_at_decisions_by_those_that_fly(hold):
     assert sent.equal(3 * (alive & decides))
 
 
+def test_weights_of_a_scheme_do_not_cross_a_missing_link():
+    net, features = network("mean"), drawn(1, ENVS * UAVS, SIZE)
+    message, hears = drawn(ENVS, UAVS, SIZE), links(1)[:, 0]
+    net.messages.weights = lambda features, key, hears: torch.ones(hears.shape)
+    heard = net.messages(features, message, message[..., :0], hears)
+    assert heard.view(message.shape).equal(hears.double() @ message)
+
+
 def test_a_lost_message_contributes_nothing():
     """With all messages lost, a team flies as with the radio off; with none lost, otherwise."""
     more = {"policy.message": "attention", "policy.memory": "none", "policy.hold": 1}
