@@ -76,8 +76,6 @@ BURNT: Final = "burnt"
 FRONT_AGE: Final = "front_age"
 """float32 [num_envs]: mean steps since a burning cell was last seen by any UAV, from its ignition
 if it was not seen since; over all burning cells and steps so far. Only with `measures: all`."""
-FRONT_AGE_P95: Final = "front_age_p95"
-"""float32 [num_envs]: 95th percentile of the same steps. Only with `measures: all`."""
 BASE_SEEN: Final = "base_seen"
 """int64 [num_envs]: cells with a sighting in flames known to the base. Only with a base."""
 BASE_AGE: Final = "base_age"

@@ -82,14 +82,6 @@ def front_age(steps: Steps) -> Tensor:
     return steps[keys.FRONT_AGE][..., -1]
 
 
-def front_age_p95(steps: Steps) -> Tensor:
-    """Returns the 95th percentile of the ages of `front_age`.
-
-    Above 511 steps it is rounded down by less than 1 %.
-    """
-    return steps[keys.FRONT_AGE_P95][..., -1]
-
-
 def bytes_per_step(steps: Steps) -> Tensor:
     """Returns the bytes that a UAV sends in a step, mean over UAVs and steps.
 
@@ -139,10 +131,7 @@ _PAPER = (
     *(mean_reward, coverage, coverage_auc, time_to_full_coverage, tracking_first, tracking_last),
     *(boundary_exits, fire_losses),
 )
-_MEASURED = {
-    **{front_age: keys.FRONT_AGE, front_age_p95: keys.FRONT_AGE_P95},
-    **{bytes_per_step: keys.BYTES_SENT},
-}
+_MEASURED = {front_age: keys.FRONT_AGE, bytes_per_step: keys.BYTES_SENT}
 _OF_BASE = dict.fromkeys((base_coverage, base_coverage_auc, base_age), keys.BASE_SEEN)
 """measures that only some worlds have, and the key by which an episode shows that it has them"""
 
@@ -184,7 +173,7 @@ _COUNTED = (
     *(keys.REWARD, keys.SEEN, keys.BURNT),
     *(keys.NEW_FIRE, keys.OLD_FIRE, keys.HIT_BOUNDARY),
 )
-_AT_THE_END = (keys.FRONT_AGE, keys.FRONT_AGE_P95, keys.BASE_AGE)
+_AT_THE_END = (keys.FRONT_AGE, keys.BASE_AGE)
 """keys whose last step `episode_metrics` reads; only some worlds have them"""
 
 

@@ -325,7 +325,7 @@ class WildfireEnv(EnvBase):
 
     def _measured(self) -> dict[str, Tensor]:
         """Returns what no UAV knows: the measures so far, and the map."""
-        measures = {} if self._measures is None else self._measures.values(self._time)
+        measures = {} if self._measures is None else self._measures.values()
         return measures | ({keys.TRUE_MAP: self.fire_map} if self._shows_map else {})
 
     def _observe(self, position: Tensor, counts: Tensor, time: Tensor) -> Tensor:

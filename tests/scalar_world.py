@@ -80,9 +80,3 @@ class ScalarWorld:
 
     def last_seen(self, radio: int, cell) -> int:
         return max(self.known[radio][cell], default=-1)
-
-
-def percentile(values: list[int], share: float) -> float:
-    """Returns the nearest-rank percentile; 0 without values."""
-    ordered = sorted(values)
-    return float(ordered[math.ceil(share * len(ordered)) - 1]) if ordered else 0.0

@@ -85,7 +85,7 @@ def encode(shown: Sequence[Recording], fire: str) -> bytes:
 
 def _panel(shown: Recording) -> dict[str, Any]:
     """Returns the data of an episode; `steps` has a row for each number, with all its steps."""
-    world, steps = shown.world, shown.steps | shown.ages()
+    world, steps = shown.world, shown.steps | {"front_age": shown.front_age()}
     fails = [int(step) for step in steps.pop("alive").sum(0)]
     if not steps["lost"].any():
         del steps["lost"]

@@ -16,7 +16,7 @@ from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.world.exchange import Exchange
-from emberlink.envs.world.measures import age_limits, whole_steps
+from emberlink.envs.world.measures import whole_steps
 from emberlink.envs.world.radio import Channel
 from emberlink.envs.world.sensor import Sensor
 
@@ -67,19 +67,16 @@ class Recording:
             first[self._seen(step)] = step
         return first
 
-    def ages(self) -> dict[str, NDArray[Any]]:
-        """Returns the measures `front_age` and `front_age_p95` up to each step, float32 [T + 1]."""
-        since, counts = self.ignition.copy(), np.zeros(self.horizon + 1, int)
-        every, limits = np.arange(self.horizon + 1), age_limits(self.horizon).numpy()
-        ages = np.zeros((2, self.horizon + 1), np.float32)
+    def front_age(self) -> NDArray[Any]:
+        """Returns the measure `front_age` up to each step, float32 [T + 1]."""
+        since, total, count = self.ignition.copy(), 0, 0
+        means = np.zeros(self.horizon + 1, np.float32)
         for step in range(1, self.horizon + 1):
             since[self._seen(step)] = step
-            counts += np.bincount(step - since[self._burns(step)], minlength=len(counts))
-            rank = math.ceil(counts.sum() * 0.95)
-            highest = (counts.cumsum() < rank).sum()
-            ages[0, step] = counts @ every / max(counts.sum(), 1)
-            ages[1, step] = limits[np.searchsorted(limits, highest, "right") - 1]
-        return dict(zip(("front_age", "front_age_p95"), ages, strict=True))
+            ages = step - since[self._burns(step)]
+            total, count = total + ages.sum(dtype=np.int64), count + ages.size
+            means[step] = total / max(count, 1)
+        return means
 
     def _burns(self, step: int) -> NDArray[np.bool_]:
         return (self.ignition <= step) & (step < self.end)

@@ -142,7 +142,6 @@ def test_every_number_is_that_of_the_environment(tab, episodes):
                 "base_coverage": share(now[keys.BASE_SEEN], now[keys.BURNT]),
                 **{name: text(now[name], 0) for name in ("seen", "burnt", "burning", "base_seen")},
                 **{name: text(now[name], 2) for name in ("front_age", "base_age")},
-                "front_age_p95": text(now[keys.FRONT_AGE_P95], 0),
                 "known": text(episode.known[step][uav], 0),
                 **{"x": text(x, 2), "y": text(y, 2), "z": text(z, 2)},
             }

@@ -18,7 +18,6 @@ function numbers(panel, step) {
     ["burnt", "of", panel.burnt(step), 0, " burnt"],
     ["burning", "burning now", panel.burning(step), 0, ""],
     ["front_age", "front age so far", panel.front_age(step), 2, " steps"],
-    ["front_age_p95", "its 95th percentile", panel.front_age_p95(step), 0, ""],
   ];
   if (panel.base_seen) {
     const covered = ratio(panel.base_seen(step), panel.burnt(step));
