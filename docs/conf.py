@@ -41,7 +41,6 @@ html_context = {"default_mode": "auto"}
 html_title = f"emberlink {version}"
 html_copy_source = False
 html_show_sourcelink = False
-html_show_search_summary = False  # a page opened from a file cannot read other files
 html_theme_options = {
     "navigation_depth": 2,
     "show_toc_level": 2,
