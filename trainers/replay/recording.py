@@ -164,10 +164,11 @@ class Recorder:
         looks = alive & (step > 0)  # nobody looks at the reset
         view = self._view(position, looks)
         found = {"view": view}
-        if self._world.radio.bandwidth is not None:  # a radio may say nothing, as it does not fit
+        if self._world.radio.packets:  # a radio may say nothing, as it has no news or does not fit
             says = now.get(keys.BYTES_SENT, alive).unsqueeze(1) > 0
             says = nn.functional.pad(says, (0, near.shape[1] - says.shape[2]), value=True)
             near, hears = near & says, hears & says
+        if self._world.radio.bandwidth is not None:
             uavs, none = alive.shape[1], torch.zeros_like(alive, dtype=torch.int64)
             waits = (one.waits[self.member, :uavs].cpu() for one in self._exchanges)
             found["waits"] = sum(waits, none)
