@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from emberlink.envs.utils.atomic_io import user_path
-from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.comparison.comparison import Comparison, compare_runs
 from emberlink.trainers.comparison.report import free_folder, write_report
 from emberlink.trainers.config.compose import resolve
@@ -18,7 +17,7 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import GROUPS
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
 from emberlink.trainers.evaluation.evaluate_run import evaluate_run
-from emberlink.trainers.evaluation.policy import adopted, load
+from emberlink.trainers.evaluation.policy import to_evaluate
 from emberlink.trainers.evaluation.scores import Results
 from emberlink.trainers.terminal.signals import Interruption
 from emberlink.trainers.training.resume import resume as resumed
@@ -145,16 +144,11 @@ def evaluate(
     report = progress or (lambda *_: None)
     settings |= {} if episodes is None else {"evaluation.episodes": episodes}
     settings |= {} if scripted else {"evaluation.scripted": []}
-    if method is None and (name or not isinstance(policy, str | os.PathLike)):
-        raise UserError("evaluate(policy, METHOD, ...): METHOD says which observations it reads")
-    if method is None:
-        played = load(policy, checkpoint=checkpoint, device=device, **settings)
-    else:
-        chosen = [f"{key}={settings.pop(key)}" for key in GROUPS if key in settings]
-        settings |= {} if device is None else {"device": device}
-        played, run = adopted(policy, method, chosen, name=name, **settings)
-        if run is not None:
-            return evaluate_run(run, played, report=report)
+    chosen = [f"{key}={settings.pop(key)}" for key in GROUPS if key in settings]
+    about = {"name": name, "checkpoint": checkpoint, "device": device}
+    played, run = to_evaluate(policy, method, chosen, **about, **settings)
+    if run is not None:
+        return evaluate_run(run, played, report=report)
     fires = played.config.evaluation.episodes
     return evaluate_policy(played.config, played.actor, fires=fires, report=report)
 

@@ -21,7 +21,7 @@ from emberlink.trainers.cli.main import main
 from emberlink.trainers.comparison.reading import read_all
 from emberlink.trainers.evaluation.export import export
 from emberlink.trainers.evaluation.foreign import FOREIGN, OnnxPolicy, new_run, reference_of
-from emberlink.trainers.evaluation.policy import adopted, opened
+from emberlink.trainers.evaluation.policy import opened, to_evaluate
 from emberlink.trainers.runs.pretrained import find
 
 WORLD = {"setup": "tuned", "horizon": 20, "num_uavs": 3, "evaluation.scripted": []}
@@ -205,7 +205,7 @@ def test_comparisons_and_replays_read_its_folder(source, capsys):
     assert trainers.evaluate(folders[0], episodes=2)["huygens"] == again["huygens"]
     assert main(["render", str(folders[0]), "--output", "replay.html"]) == 0
     assert "turner" in trainers.load(folders[0]).panel().title
-    adopted(folders[0], "independent", ["env.num_uavs=2"])
+    to_evaluate(folders[0], "independent", ["env.num_uavs=2"])
 
 
 def test_a_folder_that_names_code_inside_it_is_refused(tmp_path):
@@ -230,7 +230,7 @@ def test_a_folder_that_names_code_inside_it_is_refused(tmp_path):
 )
 def test_a_policy_of_another_method_flies_where_it_observes_the_same(name, method, message):
     with pytest.raises(UserError, match=message) if message else nullcontext():
-        adopted(f"pretrained:{name}", method)
+        to_evaluate(f"pretrained:{name}", method)
 
 
 def exported(run, tmp_path):
@@ -279,7 +279,7 @@ def test_an_onnx_file_acts_like_the_run(settings, tmp_path):
     late = {"num_uavs": 3, "radio.delay": 7} if policy.config.env.radio.delay else {}
     for key, made in late.items():
         with pytest.raises(UserError, match=f"policy.onnx: env.{key}=5; .* for env.{key}={made}"):
-            adopted(str(tmp_path / "policy.onnx"), "independent", [f"env.{key}=5"])
+            to_evaluate(str(tmp_path / "policy.onnx"), "independent", [f"env.{key}=5"])
     card = json.loads((tmp_path / "policy.json").read_text())
     assert card["method"] == "independent"
     assert list(card["inputs"]) == list(onnx.inputs)

@@ -19,8 +19,8 @@ from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError, naming
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate
-from emberlink.trainers.evaluation.foreign import FOREIGN, foreign_name, is_reference
-from emberlink.trainers.evaluation.policy import TrainedPolicy, adopted, load
+from emberlink.trainers.evaluation.foreign import FOREIGN, foreign_name
+from emberlink.trainers.evaluation.policy import TrainedPolicy, to_evaluate
 from emberlink.trainers.evaluation.scores import CURVES, LEARNED, Results, print_results, reporter
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.recording import Recorder, Recording
@@ -35,33 +35,23 @@ _MAX_LABEL = 150
 
 def run_command(options: argparse.Namespace, console: Console) -> int:
     """Runs `emberlink eval`: evaluates a run, prints the table and returns 0."""
-    changes, file = options.overrides, options.checkpoint
-    if is_reference(options.folder) or options.name:
-        (policy, run), changes = _adopted(options), []
-    else:
-        policy = load(options.folder, changes, checkpoint=file, device=options.device)
+    changes, file, name, method = options.overrides, options.checkpoint, options.name, None
+    if name and changes and "=" not in changes[0]:
+        method, *changes = changes
+    about = {"name": name or "", "checkpoint": file, "device": options.device}
+    policy, run = to_evaluate(options.folder, method, changes, **about)
+    label = ""
+    if run is None:
         run = open_run(options.folder)  # copies a trained policy of the package once all is checked
-    parts = [file.stem] if file else []
-    parts += [re.sub(r"[^\w.=+-]", "-", text) for text in changes]
-    label = "".join(f"_{part}" for part in parts)
+        parts = [file.stem] if file else []
+        parts += [re.sub(r"[^\w.=+-]", "-", text) for text in changes]
+        label = "".join(f"_{part}" for part in parts)
     if len(label) > _MAX_LABEL:
         label = f"{label[: _MAX_LABEL - 9]}_{hashlib.sha256(label.encode()).hexdigest()[:8]}"
     results = evaluate_run(run, policy, options.fires, report=reporter(console), label=label)
     print_results(console, results, policy.config, foreign_name(run))
     console.print(str(run.path), soft_wrap=True)
     return 0
-
-
-def _adopted(options: argparse.Namespace) -> tuple[TrainedPolicy, Any]:
-    """Returns a policy that is evaluated with a method and a name, and its new run folder."""
-    method, *settings = options.overrides or [""]
-    if not method or "=" in method or not options.name or options.checkpoint:
-        raise UserError(
-            f"{options.folder}: expected emberlink eval {options.folder} METHOD [key=value ...] "
-            "--name NAME; METHOD says which observations it reads"
-        )
-    settings += [f"device={options.device}"] if options.device else []
-    return adopted(options.folder, method, settings, name=options.name)
 
 
 def evaluate_run(

@@ -36,6 +36,7 @@ from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.runs.checkpoint import load_weights, read_header
 from emberlink.trainers.runs.pretrained import read_run
+from emberlink.trainers.runs.run_folder import RunFolder
 
 _CHANGEABLE = ("world", "edition", "fire", "env", "comm", "evaluation")
 """groups of keys that an evaluation can change"""
@@ -197,18 +198,34 @@ def opened(text: str) -> tuple[Any, str]:
     return load(text), str(read_run(text).path.absolute())
 
 
-def adopted(
-    policy: Any, method: str, overrides: Sequence[str] = (), *, name: str = "", **settings: Any
-) -> tuple[TrainedPolicy, Any]:
-    """Returns a policy for the environment of a method, and with a `name` its new run folder.
+def to_evaluate(
+    policy: Any,
+    method: str | None,
+    overrides: Sequence[str] = (),
+    *,
+    name: str = "",
+    checkpoint: str | PathLike[str] | None = None,
+    device: str | None = None,
+    **settings: Any,
+) -> tuple[TrainedPolicy, RunFolder | None]:
+    """Returns a policy to evaluate, and with a `name` its new run folder.
 
-    `policy` is one of `foreign.ForeignPolicy`, or a text, see `opened`. A run, or an ONNX file of
-    `emberlink export`, chooses setup, world and hold unless `overrides` or `settings` do.
+    Without a method, `policy` is a run, see `load`. With a method, whose environment it gets, it is
+    one of `foreign.ForeignPolicy`, or a text, see `opened`. A run, or an ONNX file of `emberlink
+    export`, then chooses setup, world and hold unless `overrides` or `settings` do.
     """
-    place, reference = name or "policy", ""
-    if isinstance(policy, str | PathLike):
-        place = fspath(policy)
-        policy, reference = opened(place)
+    text = fspath(policy) if isinstance(policy, str | PathLike) else ""
+    if method is None and text and not name and not is_reference(text):
+        return load(text, overrides, checkpoint=checkpoint, device=device, **settings), None
+    if method is None or checkpoint is not None:
+        raise UserError(
+            f"{text or 'evaluate'}: expected emberlink eval POLICY METHOD [key=value ...] --name "
+            "NAME, or evaluate(POLICY, METHOD, ...); METHOD says which observations it reads"
+        )
+    settings |= {} if device is None else {"device": device}
+    place, reference = text or name or "policy", ""
+    if text:
+        policy, reference = opened(text)
     usual = _card(policy).get("settings", ())
     if usual and _card(policy)["method"] != method:
         usual = [text for text in usual if not text.startswith("comm.")]
