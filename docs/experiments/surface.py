@@ -5,7 +5,7 @@
 A POLICY is a run, `pretrained:METHOD`, or the name of a scripted policy. Each plays frozen, in the
 world of `key=value`, on the same test fires with each radio, with the radio off and without limits.
 NAME.jsonl gets a line for each; what is in it is not played again. NAME.png is drawn from its lines
-at the end, at Ctrl-C, and without a POLICY. It shows the gain of messages in the headline and,
+with these `key=value` at the end, at Ctrl-C, and where no POLICY is named. It shows the gain of messages in the headline and,
 below, their value (docs/comparison.md), with 95 % intervals over fires.
 """
 
@@ -96,8 +96,8 @@ def main(name: str, *words: str) -> None:
                 with path.open("a") as file:
                     file.write(json.dumps(found[played]) + "\n")
     finally:
-        if found:
-            drawn = dict.fromkeys(played[0] for played in found)
+        off = {played for played in found if played[1:] == (*changes, *OFF)}
+        if drawn := dict.fromkeys(played[0] for played in found if played in off):
             draw(found, [*drawn], changes, Path(f"{name}.png"))
 
 

@@ -9,6 +9,10 @@ from emberlink.envs import keys
 from emberlink.trainers import make_env
 
 
+LIMITED = {"env.radio.delay": 2, "env.radio.bandwidth": 40, "env.radio.loss": 0.3}
+
+
+@pytest.mark.parametrize("radio", [{}, LIMITED], ids=["at once", "limited"])
 @pytest.mark.parametrize(
     ("method", "observation"),
     [
@@ -16,7 +20,7 @@ from emberlink.trainers import make_env
         ("maps", "map"),
     ],
 )
-def test_nothing_that_a_uav_does_reaches_one_out_of_range(method, observation):
+def test_nothing_that_a_uav_does_reaches_one_out_of_range(method, observation, radio):
     """UAV 0 crosses a burning map; UAV 1 flies ahead of it, out of range, or keeps away.
 
     Where UAV 0 sees nothing, another fire burns.
@@ -28,7 +32,7 @@ def test_nothing_that_a_uav_does_reaches_one_out_of_range(method, observation):
         env = make_env(
             method, fire=fire, seed=3, num_uavs=2, horizon=80,
             observation=observation, knowledge="own", altitude=[1.0, 4.0],
-            **{"env.radio.range": 0.5, "env.displacement": 0.3},
+            **{"env.radio.range": 0.5, "env.displacement": 0.3, **radio},
         )  # fmt: skip
         td = env.reset(position=torch.tensor([[2.0, 7.0, 4.0], [3.0, 7.0, 3.0]]))
         result = {}
