@@ -18,7 +18,6 @@ from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.base import SCRIPTED, Scripted
 from emberlink.trainers.cli.main import main
-from emberlink.trainers.comparison.reading import read_all
 from emberlink.trainers.evaluation.export import export
 from emberlink.trainers.evaluation.foreign import FOREIGN, OnnxPolicy, new_run, reference_of
 from emberlink.trainers.evaluation.policy import opened, to_evaluate
@@ -165,13 +164,8 @@ def test_a_dictionary_where_an_observation_has_several_tensors():
 )
 def test_a_policy_that_fails_is_one_line_with_its_name(source, name, message):
     with pytest.raises(UserError, match=message) as error:
-        score(name, name="mine", **{"evaluation.scripted": ["stationary"]})
+        score(name, name="mine")
     assert "\n" not in str(error.value)
-    for folder in Path().glob("runs/*"):  # none if there is no such policy
-        saved = json.loads((folder / "eval.json").read_text())
-        assert list(saved["results"]["huygens"]) == ["stationary"]
-        ((_, why),) = read_all([folder])[1]
-        assert saved["failed"] in why
 
 
 class Broken(Scripted):

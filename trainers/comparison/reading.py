@@ -40,8 +40,6 @@ class Evaluation:
     world: str = "paper"
     message_fault: str = "none"
     """`evaluation.message_fault`"""
-    failed: str = ""
-    """why there are no results of a policy that emberlink has not trained"""
     environment: Settings = Field(default_factory=dict)
     """settings of the environment"""
     communication: dict[str, Settings] = Field(default_factory=dict)
@@ -139,10 +137,7 @@ def read(path: Path) -> Run:
 def read_evaluation(file: Path) -> Evaluation:
     """Returns the content of an eval.json."""
     with naming(file):
-        evaluation = from_plain(Evaluation, json.loads(read_text(file, MAX_JSON)))
-    if evaluation.failed:
-        raise UserError(f"{file}: {evaluation.failed}")
-    return evaluation
+        return from_plain(Evaluation, json.loads(read_text(file, MAX_JSON)))
 
 
 def evaluated_otherwise(run: Run, file: Path) -> list[Run]:

@@ -108,7 +108,7 @@ def evaluation_fires(config: RunConfig, count: int, split: Split = "test") -> di
 
 def evaluate(
     config: RunConfig,
-    actor: Policy | None,
+    actor: Policy,
     *,
     fires: int,
     report: Callable[[str, str], None] = lambda *_: None,
@@ -121,7 +121,6 @@ def evaluate(
     product depends on the number of rows.
 
     Args:
-        actor: the frozen policy; None for the scripted ones alone.
         fires: number of test fires, one episode each.
         report: called with the names of the fire and the policy before each evaluation.
         watch: watches the first batch of the frozen policy on the fires of `shown_scenario`.
@@ -130,10 +129,9 @@ def evaluate(
     for fire, arrival in evaluation_fires(config, fires).items():
         say = partial(report, fire)
         results[fire] = {}
-        if actor is not None:
-            say(LEARNED)
-            watched = watch if fire == shown_scenario(config) else None
-            results[fire][LEARNED] = play_learned(config, actor, arrival, watch=watched)
+        say(LEARNED)
+        watched = watch if fire == shown_scenario(config) else None
+        results[fire][LEARNED] = play_learned(config, actor, arrival, watch=watched)
         for name in config.evaluation.scripted:
             try:
                 results[fire][name] = play_scripted(config, name, arrival, report=say)

@@ -5,7 +5,6 @@ import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from rich.console import Console
 
 from emberlink.envs.rendering.film import write_gif
 from emberlink.envs.scenarios import fires_of
-from emberlink.envs.utils.errors import UserError, naming
+from emberlink.envs.utils.errors import naming
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.evaluation.foreign import FOREIGN, foreign_name
@@ -72,15 +71,10 @@ def evaluate_run(
     config, checkpoint = policy.config, policy.checkpoint
     fires = fires or config.evaluation.episodes
     recorder = Recorder()
-    play, failed = partial(evaluate.evaluate, config, fires=fires, report=report), ""
-    try:
-        results = play(policy.actor, watch=recorder.add)
-    except UserError as error:
-        if checkpoint.name != FOREIGN or not config.evaluation.scripted:
-            raise
-        results, failed = play(None), str(error)
-    else:
-        _draw(run, config, recorder.recording(policy.title), label)
+    results = evaluate.evaluate(
+        config, policy.actor, fires=fires, report=report, watch=recorder.add
+    )
+    _draw(run, config, recorder.recording(policy.title), label)
     scenarios = evaluate.evaluation_scenarios(config)
     policies = next(iter(results.values()))
     content = {
@@ -102,11 +96,8 @@ def evaluate_run(
         "device": config.device,
         "versions": versions(),
         "results": results,
-        "failed": failed,
     }
     run.write(f"eval{label}.json", content)  # last: an evaluation with this file is complete
-    if failed:
-        raise UserError(f"{failed}; results of the others: {run.path / f'eval{label}.json'}")
     return results
 
 
