@@ -1,7 +1,6 @@
 """Tests policies that emberlink has not trained, and exported policies."""
 
 import json
-import warnings
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,6 @@ from torchrl.modules import GRUModule
 import emberlink.trainers as trainers
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.scripted.base import SCRIPTED, Scripted
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.evaluation.export import export
 from emberlink.trainers.evaluation.foreign import FOREIGN, OnnxPolicy, new_run, reference_of
@@ -36,7 +34,7 @@ def turn(observation, state):
     return np.full((*observation.shape[:2], 3), (-1.0) ** count), count
 
 def fails(observation):
-    raise ValueError("no fuel")
+    return 1 / 0
 shrinks = lambda observation: observation[0, :, :3]
 divides = lambda observation: observation[..., :3] / 0
 """
@@ -156,32 +154,26 @@ def test_a_dictionary_where_an_observation_has_several_tensors():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("mine.py:fails", r"mine: ValueError: no fuel \(.*mine.py:13\)"),
         ("mine.py:shrinks", r"mine: .*\[3, 3\]; expected \[50, 3, 3\]"),
         ("mine.py:divides", "mine: an action is NaN or infinite"),
         ("mine.py:rises", "known: rise, turn"),
+        ("yours.py:rise", "yours.py: there is no such file"),
+        ("yours.one:rise", "yours.one: No module named 'yours'"),
     ],
 )
-def test_a_policy_that_fails_is_one_line_with_its_name(source, name, message):
+def test_a_wrong_name_shape_or_number_is_one_line(source, name, message):
     with pytest.raises(UserError, match=message) as error:
         score(name, name="mine")
     assert "\n" not in str(error.value)
 
 
-class Broken(Scripted):
-    def forward(self, tensordict):
-        raise ValueError("no fuel")
-
-
-def test_a_scripted_policy_of_another_package_that_fails_leaves_the_others(monkeypatch):
-    known, find = type(SCRIPTED), type(SCRIPTED).find
-    monkeypatch.setattr(known, "find", lambda of, x: Broken if x == "broken" else find(of, x))
-    names = ["broken", "stationary"]
-    more = {"horizon": 20, "evaluation.scripted": names}
-    with warnings.catch_warnings(record=True) as caught:
-        results = trainers.evaluate("pretrained:consensus", episodes=1, **more)
-    assert "broken: ValueError: no fuel; left out" in [str(one.message) for one in caught]
-    assert set(results["huygens"]) == {"learned", "stationary"}
+def test_errors_of_its_own_code_keep_their_traceback(source):
+    with pytest.raises(ZeroDivisionError) as error:
+        score("mine.py:fails")
+    assert error.traceback[-1].path == source / "mine.py"
+    Path("imports.py").write_text("import no_such_module")
+    with pytest.raises(ModuleNotFoundError):
+        score("imports.py:act")
 
 
 def test_comparisons_and_replays_read_its_folder(source, capsys):

@@ -3,7 +3,6 @@
 import hashlib
 import inspect
 import json
-import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -133,12 +132,7 @@ def evaluate(
         watched = watch if fire == shown_scenario(config) else None
         results[fire][LEARNED] = play_learned(config, actor, arrival, watch=watched)
         for name in config.evaluation.scripted:
-            try:
-                results[fire][name] = play_scripted(config, name, arrival, report=say)
-            except Exception as error:
-                if SCRIPTED.find(name).__module__.startswith("emberlink."):
-                    raise
-                warnings.warn(f"{name}: {type(error).__name__}: {error}; left out", stacklevel=2)
+            results[fire][name] = play_scripted(config, name, arrival, report=say)
     return results
 
 

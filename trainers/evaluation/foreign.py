@@ -6,7 +6,6 @@ import inspect
 import json
 import re
 import sys
-import traceback
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -41,7 +40,7 @@ class ForeignPolicy(TensorDictModuleBase):
             tensors. Where an observation has several tensors, they come as a dictionary by name.
             With a second argument it gets its state of the decision before, None at the first, and
             returns the action and the new state.
-        name: begins the message if the policy fails.
+        name: begins the message if its actions have another shape, are NaN or infinite.
         observed: keys of the observation, see `keys.observation_keys`.
     """
 
@@ -65,14 +64,6 @@ class ForeignPolicy(TensorDictModuleBase):
         try:
             with set_exploration_type(ExplorationType.DETERMINISTIC):
                 action = self._act(tensordict)
-        except UserError:
-            raise
-        except Exception as error:
-            last = traceback.extract_tb(error.__traceback__)[-1]
-            told = " ".join(str(error).split())[:300]
-            raise UserError(
-                f"{self.name}: {type(error).__name__}: {told} ({last.filename}:{last.lineno})"
-            ) from error
         finally:
             for layer in in_training:
                 layer.training = True
@@ -125,10 +116,9 @@ class OnnxPolicy:
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
-        try:
+        self.file = file
+        with naming(file, Exception):  # onnxruntime's errors share no class
             self.session = onnxruntime.InferenceSession(str(file), options)
-        except Exception as error:  # onnxruntime's errors share no class
-            raise UserError(f"{file}: {' '.join(str(error).split())[:300]}") from None
         self.inputs = {one.name: one for one in self.session.get_inputs()}
         self.outputs = [one.name for one in self.session.get_outputs()]
         if "action" not in self.outputs:
@@ -148,7 +138,8 @@ class OnnxPolicy:
                 given[name] = value.cpu().numpy()
             else:
                 raise UserError(f"the policy reads {name!r}, which is not observed here")
-        out = dict(zip(self.outputs, self.session.run(None, given), strict=True))
+        with naming(self.file, Exception):  # such as inputs of another shape
+            out = dict(zip(self.outputs, self.session.run(None, given), strict=True))
         after = {name.removeprefix("next_"): v for name, v in out.items() if name != "action"}
         return torch.as_tensor(out["action"]).to(place), after
 
@@ -200,15 +191,12 @@ def open_policy(text: str) -> tuple[Any, str]:
     """Returns the policy of `module:name`, `file.py:name` or `file.onnx`; see `policy.opened`.
 
     The second result is FILE:NAME or FILE.onnx with the whole path, by which it is opened again. A
-    UserError if there is no such file, module or name, or importing it fails.
+    UserError if there is no such file, module or name.
     """
     if text.endswith(".onnx"):
         return OnnxPolicy(Path(text)), str(Path(text).absolute())
     place, name = (text, "") if text.endswith(".py") else _split(text)
-    try:
-        module = _module(place)
-    except Exception as error:
-        raise UserError(f"{text}: {type(error).__name__}: {error}") from error
+    module = _module(place)
     if not callable(policy := getattr(module, name, None)) or inspect.isclass(policy):
         known = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
         raise UserError(f"{text}: expected {place}:NAME of a function; known: {', '.join(known)}")
@@ -225,6 +213,8 @@ def _split(text: str) -> tuple[str, str]:
 def _module(place: str) -> Any:
     """Imports a module of the working folder, or a file, which may import what is beside it."""
     is_file = place.endswith(".py")
+    if is_file and not Path(place).is_file():
+        raise UserError(f"{place}: there is no such file")
     folder = str(Path(place).absolute().parent) if is_file else ""  # as with python FILE or -m
     sys.path.insert(0, folder)
     try:
@@ -235,6 +225,10 @@ def _module(place: str) -> Any:
         sys.modules[place] = module  # where dataclasses look for it
         spec.loader.exec_module(module)
         return module
+    except ModuleNotFoundError as error:
+        if f"{place}.".startswith(f"{error.name}."):  # not of what the module imports
+            raise UserError(f"{place}: {error}") from None
+        raise
     finally:
         sys.path.remove(folder)
 
