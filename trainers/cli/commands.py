@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 EXTRAS = {  # of `compare`, beside its page
-    "csv": "compare.csv, one row per run, fire and measure",
-    "latex": "compare.tex, the rankings by the world's headline measure",
     "marl-eval": "marl_eval.json, training and held-out fires in the format of MARL-eval",
     "pdf": "the figures as PDF",
     "svg": "the figures as SVG",

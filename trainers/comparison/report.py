@@ -172,8 +172,8 @@ def write_report(
 ) -> Comparison:
     """Writes compare.html, compare.json and the extras into a new or empty folder.
 
-    `say` is called with a line of text before the figures of each section; `extras` are "csv",
-    "latex", "marl-eval", and "pdf" and "svg" for the figures.
+    `say` is called with a line of text before the figures of each section; `extras` are
+    "marl-eval", and "pdf" and "svg" for the figures.
     """
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -198,10 +198,6 @@ def write_report(
         comparison=comparison, chapters=chapters, settings=about(), numbers=NUMBERS
     )
     texts = {"compare.html": page, "compare.json": comparison.to_json()}
-    if "csv" in extras:
-        texts["compare.csv"] = comparison.table.to_csv(index=False)
-    if "latex" in extras:
-        texts["compare.tex"] = _latex(comparison)
     if "marl-eval" in extras:
         texts["marl_eval.json"] = _marl_eval(comparison)
     for name, text in texts.items():
@@ -241,18 +237,6 @@ def _chapter(
         "training": training,
         "details": _details(runs, folder),
     }
-
-
-def _latex(comparison: Comparison) -> str:
-    """Returns a LaTeX table for each section and set of fires: the headline measure by rank."""
-    texts: list[str] = []
-    for (section, fires), part in comparison.ranking.groupby(["section", "fires"], sort=False):
-        measure = part["measure"].iloc[0]
-        caption = f"{section}, on {fires}: {measure}".replace("_", r"\_")
-        rows = _table("", caption, part[part["measure"] == measure], _ranked).rows
-        rows = rows.drop(columns="measure")
-        texts.append(rows.to_latex(index=False, escape=True, caption=caption))
-    return "\n".join(texts)
 
 
 def _marl_eval(comparison: Comparison) -> str:
