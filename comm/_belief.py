@@ -42,7 +42,7 @@ class BeliefMaps(nn.Module):
 
     def __init__(self, world: WildfireConfig, envs: int):
         super().__init__()
-        self.world, self.sensor = world, Sensor.of(world)
+        self.world, self.sensor = world, Sensor(world)
         uavs, settings = world.num_uavs, world.map
         entries, last = self.sensor.area + uavs, 4 * world.horizon + 3
         self.known = Knowledge(envs=envs, uavs=uavs, area=entries, horizon=last, fires=True)

@@ -101,7 +101,7 @@ class WildfireEnv(EnvBase):
         low, high = motion.corners(config.low, config.high)
         self.register_buffer("_low", low, persistent=False)
         self.register_buffer("_high", high, persistent=False)
-        sensor = Sensor.of(config)
+        sensor = Sensor(config)
         self._side = sensor.side
         fires, self._one_fire_each = load_fires(fire, config, num_envs)
         own, team = config.knowledge == "own", {"envs": num_envs, "uavs": config.num_uavs}

@@ -29,30 +29,21 @@ class Sensor(nn.Module):
     which cells it has not recognised are assumptions of this project.
 
     Args:
-        grid: cells along x and y.
-        view_angle: half the opening angle, degrees.
-        altitude: the minimum and maximum, cells; the maximum determines the size of the window.
-        recognised: the probability at either.
+        world: the world; its highest altitude determines the size of the window.
     """
 
     _offsets: Tensor
     _window: Tensor
     _weights: Tensor
 
-    def __init__(
-        self,
-        grid: tuple[int, int],
-        *,
-        view_angle: float,
-        altitude: tuple[float, float],
-        recognised: tuple[float, float] = (1.0, 1.0),
-    ):
+    def __init__(self, world: WildfireConfig):
         super().__init__()
-        self._altitude, self._recognised = altitude, recognised
-        reach = min(math.floor(view_radius(altitude[1], view_angle) + 0.5), max(grid) - 1)
+        lowest, highest = (x[2].item() for x in motion.corners(world.low, world.high))
+        self._altitude, self._recognised, grid = (lowest, highest), world.sensor, world.grid
+        reach = min(math.floor(view_radius(highest, world.view_angle) + 0.5), max(grid) - 1)
         self._inner = tuple(slice(reach, reach + side) for side in grid)
         self._padded = grid[0] + 2 * reach, grid[1] + 2 * reach
-        self._slope = math.tan(math.radians(view_angle))
+        self._slope = math.tan(math.radians(world.view_angle))
         self.side = 2 * reach + 1
         """W, cells along a side of the window"""
         offsets = torch.arange(-reach, reach + 1)
@@ -65,13 +56,6 @@ class Sensor(nn.Module):
         # Sums over a window are exact: they are whole numbers, of at most 24 bits in float32.
         exact = torch.float32 if reach * self.side**2 < 2**24 else torch.float64
         self.register_buffer("_weights", weights.to(exact), persistent=False)
-
-    @classmethod
-    def of(cls, world: WildfireConfig) -> "Sensor":
-        """Returns the sensor of the UAVs of a world."""
-        lowest, highest = (x[2].item() for x in motion.corners(world.low, world.high))
-        more = {"altitude": (lowest, highest), "recognised": world.sensor}
-        return cls(world.grid, view_angle=world.view_angle, **more)
 
     @property
     def area(self) -> int:
@@ -152,5 +136,5 @@ def search_altitude(world: WildfireConfig) -> float:
     low, high = (x[2].item() for x in motion.corners(world.low, world.high))
     altitude = torch.linspace(low, high, 61, dtype=torch.float64)
     width = 2 * view_radius(1.0, world.view_angle) * altitude
-    missed = (1 - Sensor.of(world).recognition(altitude)) ** (width / world.displacement)
+    missed = (1 - Sensor(world).recognition(altitude)) ** (width / world.displacement)
     return altitude[(width * (1 - missed)).argmax()].item()

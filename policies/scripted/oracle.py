@@ -50,7 +50,7 @@ class Oracle(Searcher):
     def __init__(self, env: WildfireEnv):
         super().__init__(env)
         self._env = (env,)  # in a tuple, so that it is not registered as a submodule
-        self._sensor = Sensor.of(self.world)
+        self._sensor = Sensor(self.world)
         self.foresees = env.burn_out is not None or self.world.base is not None
         self.period = self.period if self.foresees else 1
 

@@ -40,7 +40,7 @@ class TeamMaps(nn.Module):
     def __init__(self, env: WildfireEnv, radio: RadioConfig | None):
         super().__init__()
         world, envs = replace(env.config, radio=radio or env.config.radio), env.num_envs
-        self._env, self._world, self._sensor = (env,), world, Sensor.of(world)
+        self._env, self._world, self._sensor = (env,), world, Sensor(world)
         listens, settings = world.base is not None and radio is None, world.radio
         area = self._sensor.area + world.num_uavs
         self.known = Knowledge(

@@ -96,7 +96,7 @@ def _panel(shown: Recording) -> dict[str, Any]:
         "title": shown.title,
         "uavs": world.num_uavs,
         "base": None if world.base is None else list(world.base),
-        "side": Sensor.of(world).side,
+        "side": Sensor(world).side,
         "slope": math.tan(math.radians(world.view_angle)),
         "fails": fails,
         **({"delay": world.radio.delay} if world.radio.packets else {}),

@@ -150,7 +150,7 @@ class Recorder:
         comm = next(part for part in parts if isinstance(part, CommModule))
         self._advised = policy is None or any(key in comm.out_keys for key in policy.in_keys)
         self._hears = getattr(policy, "hears", False)
-        self._world, self._sensor = world.config, Sensor.of(world.config)
+        self._world, self._sensor = world.config, Sensor(world.config)
         arrival, burn_out = world.arrival_time[self.member].cpu(), world.burn_out
         end = torch.full_like(arrival, torch.inf) if burn_out is None else burn_out[self.member]
         self._whole = [whole_steps(times.cpu(), world.config.horizon) for times in (arrival, end)]
