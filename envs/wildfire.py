@@ -42,7 +42,6 @@ class WildfireEnv(EnvBase):
             randomness depends on (seed, i) alone. Several seeds have equal shares of the
             environments, in order; each is the same as with its seed alone.
         device: where all tensors live.
-        agent_done: whether done, terminated and truncated stand under "agents" too, per UAV.
         hold: steps for which a call of `step` holds its action; the reward is the sum over them.
         true_map: whether the map is written under `keys.TRUE_MAP`.
 
@@ -71,7 +70,6 @@ class WildfireEnv(EnvBase):
         device: torch.device | str = "cpu",
         *,
         hold: int = 1,
-        agent_done: bool = False,
         true_map: bool = False,
     ):
         if num_envs < 1:
@@ -84,7 +82,7 @@ class WildfireEnv(EnvBase):
             raise UserError(
                 f"hold={hold}: expected a divisor of the horizon, {self.config.horizon} steps"
             )
-        self._agent_done, self._shows_map = agent_done, true_map
+        self._shows_map = true_map
         self._steer: Callable[[TensorDictBase], TensorDictBase] | None = None
         self._communicate: Callable[..., Any] | None = None
         self._fire_name = fire if isinstance(fire, str) else getattr(fire, "name", None)
@@ -118,9 +116,8 @@ class WildfireEnv(EnvBase):
     def _make_specs(self) -> None:
         """Declares the tensors that the environment reads and writes; see `keys`."""
         agents, first = (self.num_envs, self.n_agents), self._first_time_step()
-        flags = [*_DONE, *((keys.AGENTS, name) for name in _DONE if self._agent_done)]
-        self.observation_spec = make_composite_from_td(first.exclude(*flags))
-        self.done_spec = make_composite_from_td(first.select(*flags))
+        self.observation_spec = make_composite_from_td(first.exclude(*_DONE))
+        self.done_spec = make_composite_from_td(first.select(*_DONE))
         action = Bounded(-1.0, 1.0, torch.Size((*agents, 3)), dtype=torch.float32)
         uavs = Composite({keys.ACTION[1]: action}, shape=agents)
         self.action_spec = Composite({keys.AGENTS: uavs}, shape=agents[:1])
@@ -308,10 +305,6 @@ class WildfireEnv(EnvBase):
             agents[keys.SIGHT[1]] = sighting.shown().unflatten(-1, square)
         truncated = (time >= self.config.horizon).unsqueeze(-1)
         flags = truncated, torch.zeros_like(truncated), truncated.clone()
-        done = dict(zip(_DONE, flags, strict=True))
-        if self._agent_done:
-            each = (*position.shape[:-1], 1)
-            agents |= {k: v.unsqueeze(-2).expand(each).clone() for k, v in done.items()}
         root = {
             keys.AGENTS: TensorDict(agents, position.shape[:-1], self.device),
             keys.RNG_KEY: self._step_key.expand(time.shape).clone(),
@@ -319,7 +312,7 @@ class WildfireEnv(EnvBase):
             keys.SEEN: seen,
             keys.BURNING: burning,
             keys.BURNT: burnt,
-            **done,
+            **dict(zip(_DONE, flags, strict=True)),
         }
         return TensorDict(root, time.shape, self.device)
 

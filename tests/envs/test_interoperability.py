@@ -9,7 +9,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from tensordict import TensorDict
-from torchrl.envs import SerialEnv, check_env_specs
+from torchrl.envs import SerialEnv
 from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys, parallel_env
@@ -56,18 +56,6 @@ def test_an_episode_with_a_base_and_spells_of_losses_repeats():
         told.append(env.rollout(30)["next", keys.BASE_SEEN])
     assert told[0].any()
     assert told[0].equal(told[1])
-
-
-@pytest.mark.filterwarnings("error")
-def test_done_per_agent():
-    env = make(agent_done=True)
-    check_env_specs(env)
-    steps = env.rollout(20)["next"]
-    for name in ("done", "terminated", "truncated"):
-        assert steps["agents", name].shape == (2, 10, 3, 1)
-        assert steps["agents", name].equal(steps[name].unsqueeze(-2).expand(-1, -1, 3, -1))
-    assert steps["truncated"][:, -1].all()
-    assert ("agents", "done") not in make().reset().keys(True)
 
 
 @pytest.mark.filterwarnings("error")
