@@ -1,4 +1,4 @@
-"""Moves UAVs and draws waypoints: pure functions of tensors.
+"""Moves UAVs and draws points: pure functions of tensors.
 
 `move` computes in float64, so that a scalar reference implementation with the same float32
 positions gives the same result.
@@ -87,21 +87,6 @@ def given_points(given: Any, shape: Sequence[int], low: Tensor, high: Tensor) ->
             f"the box {low.tolist()} to {high.tolist()}"
         )
     return points.expand(*shape)
-
-
-def next_waypoint(
-    waypoint: Tensor, position: Tensor, key: Tensor, low: Tensor, high: Tensor
-) -> Tensor:
-    """Returns the waypoints, with a new random one for each UAV closer than 1 cell to its own.
-
-    Args:
-        waypoint, position: float32 [..., n, 3], cells.
-        key: int64 [...], a random key for this purpose alone.
-        low, high: [3], the corners of the box, cells.
-    """
-    redraws = distance(position, waypoint) < 1
-    points = random_points(key, position.shape[-2], low, high)
-    return torch.where(redraws.unsqueeze(-1), points, waypoint)
 
 
 def distance(first: Tensor, second: Tensor) -> Tensor:

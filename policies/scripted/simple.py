@@ -49,7 +49,9 @@ class RandomWaypoints(Scripted):
         key = self.step_key(tensordict, Use.SCRIPTED_WAYPOINT)
         # At the first step the waypoint is the UAV's position, so a new one is drawn.
         old = self.carried(tensordict, self.WAYPOINT, position)
-        waypoint = motion.next_waypoint(old, position, key, self.low, self.high)
+        near = motion.distance(position, old) < 1
+        points = motion.random_points(key, position.shape[-2], self.low, self.high)
+        waypoint = torch.where(near.unsqueeze(-1), points, old)
         tensordict.set(self.WAYPOINT, waypoint)
         return self.fly(tensordict, waypoint)
 
