@@ -28,9 +28,6 @@ from emberlink.trainers.runs.checkpoint import read_header, versions
 from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.run_folder import RunFolder
 
-_MAX_LABEL = 150
-"""characters; a name of a file can have 255"""
-
 
 def run_command(options: argparse.Namespace, console: Console) -> int:
     """Runs `emberlink eval`: evaluates a run, prints the table and returns 0."""
@@ -45,8 +42,8 @@ def run_command(options: argparse.Namespace, console: Console) -> int:
         parts = [file.stem] if file else []
         parts += [re.sub(r"[^\w.=+-]", "-", text) for text in changes]
         label = "".join(f"_{part}" for part in parts)
-    if len(label) > _MAX_LABEL:
-        label = f"{label[: _MAX_LABEL - 9]}_{hashlib.sha256(label.encode()).hexdigest()[:8]}"
+        if len(label) > 150:  # the name of a file can have 255 characters
+            label = f"{label[:141]}_{hashlib.sha256(label.encode()).hexdigest()[:8]}"
     results = evaluate_run(run, policy, options.fires, report=reporter(console), label=label)
     print_results(console, results, policy.config, foreign_name(run))
     console.print(str(run.path), soft_wrap=True)
