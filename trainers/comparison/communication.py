@@ -11,11 +11,11 @@ import pandas as pd
 from emberlink.envs import metrics
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.bootstrap import Values
-from emberlink.trainers.comparison.reading import Run
+from emberlink.trainers.comparison.reading import EvaluatedRun
 from emberlink.trainers.comparison.tables import RADIO, WARM_START, Frame, radio_text, trained_with
 from emberlink.trainers.evaluation.scores import LEARNED
 
-SCRIPTED = ("map_greedy", "courier")
+_POLICIES = ("map_greedy", "courier")
 """scripted policies whose value of communication is computed"""
 _SAME = {"map_greedy": ("map_greedy_alone", "map_greedy_all")}
 """scripted policy -> the policies that act like it with the radio off and without limits, in worlds
@@ -34,7 +34,7 @@ policy. `none`, `with_radio` and `full` are interquartile means over seeds with 
 the world's radio and without limits; `gain` is with_radio - none, `value` is gain / (full - none),
 missing where the interval of full - none is not above 0 (below, if less is better)."""
 
-Group = list[Run]
+Group = list[EvaluatedRun]
 """the runs of a label"""
 Found = Iterator[tuple[str, str, str, list[Values]]]
 """label, measure, `radios`, and [seeds, fires] with the radio off, on and maybe without limits"""
@@ -78,7 +78,7 @@ def _of_scripted(groups: Mapping[str, Group], fires: str) -> Found:
     every = [run for group in groups.values() for run in group]
     limited = {radio_text(run.now): run for run in trained[::-1]}
     limited = {radio: run for radio, run in limited.items() if radio not in (_OFF, _FULL)}
-    for policy, (radio, world) in product(SCRIPTED, limited.items()):
+    for policy, (radio, world) in product(_POLICIES, limited.items()):
         alike = {radio_text(r.now): r for r in every[::-1] if _world(r) == _world(world)}
         choices = [(alike.get(_OFF), policy), (world, policy), (alike.get(_FULL), policy)]
         if world.settings.get("env.base") is None and policy in _SAME:
@@ -100,14 +100,14 @@ def _evaluated(group: Group, other: Group) -> bool:
 def _retrained(group: Group, other: Group) -> bool:
     """Returns whether the other group has the same seeds and settings except for the radio."""
 
-    def same(run: Run) -> dict[str, str]:
+    def same(run: EvaluatedRun) -> dict[str, str]:
         return {k: v for k, v in trained_with(run).items() if k not in (*RADIO, WARM_START)}
 
     seeds = [[run.settings["seed"] for run in runs] for runs in (group, other)]
     return not other[0].evaluated_with and seeds[0] == seeds[1] and same(group[0]) == same(other[0])
 
 
-def _world(run: Run) -> dict[str, Any]:
+def _world(run: EvaluatedRun) -> dict[str, Any]:
     """Returns the settings of an evaluation that scripted policies heed, without the radio."""
     left_out = (*RADIO, *_OF_LEARNERS)
     return {k: v for k, v in run.now.items() if k.startswith("env.") and not k.startswith(left_out)}

@@ -14,7 +14,7 @@ from emberlink.trainers.evaluation.scores import CURVES, LEARNED
 
 REWARD = "mean_reward"
 """the measure that depends on a method's own reward"""
-DIGITS = 3
+_PLACES = 3
 """decimal places in which a scripted policy may differ between devices"""
 RANKING = (
     *("section", "fires", "measure", "label", "policy", "seeds", "values", "iqm", "low", "high"),
@@ -87,7 +87,7 @@ def _scripted(means: Frame, measure: str) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for policy, part in played.groupby("policy"):
         of_labels = part.groupby("label")["value"].first()
-        groups = [group for _, group in of_labels.groupby(of_labels.round(DIGITS))]
+        groups = [group for _, group in of_labels.groupby(of_labels.round(_PLACES))]
         for group in groups:
             name = str(policy).replace("_", " ")
             name += f" ({', '.join(group.index)})" if len(groups) > 1 else ""

@@ -47,7 +47,7 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
-class Run:
+class EvaluatedRun:
     """A finished run with an evaluation."""
 
     path: Path
@@ -74,13 +74,13 @@ class Run:
 
 def read_all(
     paths: Sequence[Path | str], labels: Sequence[str] = ()
-) -> tuple[list[Run], list[LeftOut]]:
+) -> tuple[list[EvaluatedRun], list[LeftOut]]:
     """Returns the finished runs of paths, one entry per evaluation, and the runs left out."""
     if labels and len(labels) != len(paths):
         raise UserError(f"{len(labels)} labels for {len(paths)} paths: one each")
     named = zip(paths, labels or [""] * len(paths), strict=True)
     folders = {each.resolve(): (each, label) for path, label in named for each in find(path)}
-    runs: list[Run] = []
+    runs: list[EvaluatedRun] = []
     left_out: list[LeftOut] = []
 
     @contextmanager
@@ -114,7 +114,7 @@ def find(path: Path | str) -> list[Path]:
     return found
 
 
-def read(path: Path) -> Run:
+def read(path: Path) -> EvaluatedRun:
     """Returns a run; a UserError if it is not finished or not evaluated, or a file is damaged."""
     folder = RunFolder(path)
     settings = {"edition": 1, **flat(folder.values())}
@@ -131,7 +131,7 @@ def read(path: Path) -> Run:
         raise UserError(
             f"eval.json is of step {tested}, the newest checkpoint of {trained} ({again})"
         )
-    return Run(path, name or settings["method"], settings, lines[:episodes], evaluation)
+    return EvaluatedRun(path, name or settings["method"], settings, lines[:episodes], evaluation)
 
 
 def read_evaluation(file: Path) -> Evaluation:
@@ -140,7 +140,7 @@ def read_evaluation(file: Path) -> Evaluation:
         return from_plain(Evaluation, json.loads(read_text(file, MAX_JSON)))
 
 
-def evaluated_otherwise(run: Run, file: Path) -> list[Run]:
+def evaluated_otherwise(run: EvaluatedRun, file: Path) -> list[EvaluatedRun]:
     """Returns a run as evaluated in an eval_*.json; none if it repeats the settings of eval.json.
 
     A UserError if the file is damaged, or its step or fires differ from eval.json.

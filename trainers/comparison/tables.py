@@ -12,7 +12,7 @@ from typing import Any
 
 import pandas as pd
 
-from emberlink.trainers.comparison.reading import LeftOut, Run
+from emberlink.trainers.comparison.reading import EvaluatedRun, LeftOut
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH
 from emberlink.trainers.evaluation.scores import LEARNED
 from emberlink.trainers.runs import pretrained
@@ -31,7 +31,7 @@ Frame = Any
 """a pandas table; the types that pandas infers for its parts are too wide to be checked"""
 
 
-def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
+def runs_table(runs: Sequence[EvaluatedRun]) -> tuple[Frame, list[LeftOut]]:
     """Returns one row per evaluation of a run, by section, label and seed, and the runs left out.
 
     Of several runs of a label with one seed, the last by name is used, and a copy of the package's
@@ -52,7 +52,7 @@ def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
     return table[~twice].sort_values(["section", "label", "seed"], ignore_index=True), left_out
 
 
-def _of_section(run: Run) -> dict[str, Any]:
+def _of_section(run: EvaluatedRun) -> dict[str, Any]:
     """Returns the settings that are the same for all runs of a section."""
     about = {k: v for k, v in run.settings.items() if k in _OF_SECTION or k.startswith("fire.")}
     tested = run.evaluation
@@ -60,7 +60,7 @@ def _of_section(run: Run) -> dict[str, Any]:
     return about | {"fires": tested.fires, "start_seed": tested.start_seed, "held_out": sets}
 
 
-def _row(run: Run) -> dict[str, Any]:
+def _row(run: EvaluatedRun) -> dict[str, Any]:
     setup, world, fire = (run.settings[key] for key in ("setup", "world", "fire.name"))
     changed = ", ".join(f"{key}={word(value)}" for key, value in run.evaluated_with.items())
     return {
@@ -72,7 +72,7 @@ def _row(run: Run) -> dict[str, Any]:
     }
 
 
-def trained_with(run: Run) -> dict[str, str]:
+def trained_with(run: EvaluatedRun) -> dict[str, str]:
     """Returns the settings that affect training, as on the command line, but not the seed's."""
     settings = {k: word(v) for k, v in run.settings.items() if k.split(".")[0] not in NOT_COMPARED}
     if start := settings.get(WARM_START):  # each seed has another start
