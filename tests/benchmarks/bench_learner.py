@@ -1,10 +1,11 @@
 """Measures the CPU seconds of a training: its updates, and everything else."""
 
 import time
+from functools import partial
 from typing import Any
 
 import pytest
-from workloads import METHODS
+from workloads import METHODS, in_turns
 
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.setup import TrainingSetup
@@ -35,3 +36,21 @@ def test_parts_of_a_training(tell, method, setup):
         f"{setup}, {method:13}: {decisions / whole:7,.0f} team decisions a CPU second, "
         f"{100 * inside / whole:3.0f} % of the time in the learner"
     )
+
+
+@pytest.mark.parametrize(
+    ("method", "world", "plain", "fast"),
+    [
+        ("independent", "paper", "chunk=0", "chunk=25"),
+        ("maps", "front", "critic_map=false", "critic_map=true"),
+        ("maps", "front", "bfloat16=false", "bfloat16=true"),
+    ],
+)
+def test_a_setting_against_the_plain_way(tell, method, world, plain, fast):
+    """Trains episodes of 500 steps with both, in turns."""
+    common, works = ["setup=strong", f"world={world}", "env.horizon=500", "episodes=9"], []
+    for setting in (plain, fast):
+        training = TrainingSetup(resolve(method, [*common, f"learner.{setting}"]))
+        works.append(partial(training.dry_run, training.horizon))
+    slow, quick = in_turns(2, *works)
+    tell(f"strong, {method:13}: an iteration with {fast} takes {quick / slow:.2f} of {plain}")
