@@ -5,8 +5,9 @@
 A POLICY is a run, `pretrained:METHOD`, or the name of a scripted policy. Each plays frozen, in the
 world of `key=value`, on the same test fires with each radio, with the radio off and without limits.
 NAME.jsonl gets a line for each; what is in it is not played again. NAME.png is drawn from its lines
-with these `key=value` at the end, at Ctrl-C, and where no POLICY is named. It shows the gain of messages in the headline and,
-below, their value (docs/comparison.md), with 95 % intervals over fires.
+with these `key=value` at the end, at Ctrl-C, and where no POLICY is named. It shows the gain of
+messages in the headline and, below, their value (docs/comparison.md), with 95 % intervals over
+fires.
 """
 
 import json

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from emberlink.envs.config import RadioConfig, WildfireConfig
+from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.world import motion

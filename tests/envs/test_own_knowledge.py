@@ -8,7 +8,6 @@ import torch
 from emberlink.envs import keys
 from emberlink.trainers import make_env
 
-
 LIMITED = {"env.radio.delay": 2, "env.radio.bandwidth": 40, "env.radio.loss": 0.3}
 
 

@@ -117,7 +117,8 @@ def gain_and_value(measure: str, samples: Sequence[Values], *, retrained: bool) 
     """Returns the numbers of samples [seeds, fires]: radio off, the world's and maybe no limits."""
     means = [sample.mean(1) for sample in samples]
     ends = partial(bootstrap.crossed_interval, seeds=retrained)
-    row = dict(zip(("none", "with_radio", "full"), map(bootstrap.iqm, means), strict=False))
+    radios = "none", "with_radio", "full"
+    row: dict[str, Any] = dict(zip(radios, map(bootstrap.iqm, means), strict=False))
     row["gain"] = bootstrap.iqm_difference(means[1], means[0])
     low_high = ends(bootstrap.iqm_difference, samples[1], samples[0])
     row["gain_low"], row["gain_high"] = low_high or (None, None)
