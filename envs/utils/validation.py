@@ -81,12 +81,16 @@ def is_index(text: str, end: int) -> bool:
     return text.isdecimal() and len(text) <= len(str(end)) and int(text) < end
 
 
-def as_argument(key: str, value: str) -> str:
-    """Returns `key=value` as it is written in a shell, for a message."""
-    if re.fullmatch(r"[^\W\d][\w-]*", value):
-        return f"{key}={value}"
-    escaped = value.replace('"', '\\"')
-    return shlex.quote(f'{key}="{escaped}"')
+def as_argument(key: str, *values: str) -> str:
+    """Returns `key=value`, or a list of values, as it is written in a shell, for a message."""
+    word = re.compile(r"(?!(true|false|null|nan|inf)$)[a-z_][\w-]*|[*]", re.IGNORECASE | re.ASCII)
+    texts = []
+    for value in values:
+        # In quotes, Hydra reads \" as ", two backslashes before a quote as one, and ${ as a key.
+        escaped = re.sub(r'(\\+)(?="|$)', r"\1\1", value).replace('"', r"\"")
+        escaped = escaped.replace("${", r"\${")
+        texts.append(value if word.fullmatch(value) else f'"{escaped}"')
+    return shlex.quote(f"{key}={texts[0] if len(texts) == 1 else '[' + ','.join(texts) + ']'}")
 
 
 def check_device(name: str) -> str:
