@@ -147,7 +147,7 @@ def keys_in(message: str) -> list[str]:
     """Returns the first keys that a message prints after `expected`, as a shell passes them on."""
     tail = message.partition("; expected ")[2]
     found = re.findall(r"""'fire\.[^']*'|fire\.\w+=(?:"[^"]*"|[^\s,;]+)""", tail)
-    count = 2 if found and found[0].startswith("fire.incident_field") else 1
+    count = 2 if found and "fire.incident_field" in found[0] else 1
     return [shlex.split(text)[0] for text in found[:count]]
 
 

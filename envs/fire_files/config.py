@@ -49,15 +49,15 @@ class FileFireConfig:
     layer: _Text | None = None
     """Layer of a GeoPackage, or variable of a NetCDF, that has several."""
     time_field: _Text | tuple[_Text, ...] | None = None
-    """Column of the perimeters' times, or the columns of the date and the time of day."""
+    """Column of the perimeters' times, or columns of the date, the time of day, or their parts."""
     time_format: Annotated[str, Field(pattern=_FORMAT, max_length=100)] | None = None
     """`day_first`, `month_first`, `seconds` since 1970, or a pattern such as `%d.%m.%y %H:%M`."""
     incident: _Text | int | None = None
     """Incident whose perimeters are read, where a file has several; "*" reads all as one fire."""
     incident_field: _Text | None = None
     """Column in which `incident` is looked for."""
-    where: _Text | None = None
-    """Features that are read, `COLUMN=VALUE` (`*` and `|` allowed) or `COLUMN` if not empty."""
+    where: _Text | tuple[_Text, ...] | None = None
+    """Features that are read: `COLUMN=VALUE` (`*`, `|` allowed), `COLUMN` if not empty, a list."""
     radius: Annotated[float, Field(gt=0, le=1e5)] | None = None
     """Radius in metres of the circle that stands for a point, such as a detection of FIRMS."""
     unburned: float | tuple[float, ...] | Literal["none"] | None = None
@@ -68,6 +68,11 @@ class FileFireConfig:
         default=None, compare=False
     )
     """A run's own copy of the grids; set when a run folder is opened, and never written."""
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """The conditions of `where`."""
+        return (self.where,) if isinstance(self.where, str) else self.where or ()
 
     @property
     def never(self) -> tuple[float, ...] | None:

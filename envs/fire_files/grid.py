@@ -26,10 +26,7 @@ def on_grid(
     horizon: int,
     report: Report,
 ) -> np.ndarray:
-    """Returns a fire on a grid (X, Y), its times stretched over an episode, float32 steps [X, Y].
-
-    0 burns from the start, inf never burns.
-    """
+    """Returns a fire on a grid, float32 steps [X, Y] of an episode: 0 from the start, inf never."""
     no_span = config.start is config.end is config.minutes_per_step is None
     in_steps = no_span and fire.clock.unit == "steps"
     start, end = (0.0, float(horizon)) if in_steps else _span(fire, config, horizon)
@@ -82,7 +79,8 @@ def _time(key: str, fire: "Raster | Perimeters", config: FileFireConfig) -> floa
         seen = f"fire.{key}={value}: times are such as {clock.format(fire.first)}"
         raise ask(seen, "one of these, or a number with fire.units")
     if isinstance(value, str):
-        date = in_utc(parse_dates([value], config.time_format, f"fire.{key}")[0])
+        form = None if value[:4].isdecimal() and value[4:5] == "-" else config.time_format
+        date = in_utc(parse_dates([value], form, f"fire.{key}")[0])
         return (date - clock.origin).total_seconds() / SECONDS[clock.unit]
     return fire.first + value * SECONDS[str(config.units)] / SECONDS[clock.unit]
 

@@ -44,7 +44,7 @@ class Perimeters:
 
     def on(self, window: Window, until: float, report: Report) -> np.ndarray:
         """Divides the time between two fronts by a sample's distances to both, float64 [X, Y]."""
-        points, idle = window.samples(), 0
+        points, idle, bare = window.samples(), 0, 0
         centres = np.stack(points.centres(), -1).reshape(-1, 2)
         index = shapely.STRtree(shapely.points(centres))  # pyright: ignore
         times, front = np.full(points.grid, np.inf), KDTree(np.empty((0, 2)))
@@ -56,6 +56,7 @@ class Perimeters:
             at = np.append(at, i[there] * points.grid[1] + j[there])
             fresh = np.isinf(times.flat[at])
             idle += k > 0 and not fresh.any()
+            bare += len(np.unique(at[~fresh])) < 0.99 * np.isfinite(times).sum()
             new, last = np.unique(at[fresh]), front
             times.flat[new] = self.at[k]
             apart = max(points.side / 2, float(shapely.length(parts).sum()) / _MAX_POINTS)
@@ -69,6 +70,7 @@ class Perimeters:
             if self.at[k] >= until:
                 break
         report.facts += [f"{idle} within the area burnt before"] if idle else []
+        report.facts += [f"{bare} without all that burnt before: the union counts"] if bare else []
         return window.earliest(times)
 
 
@@ -148,10 +150,7 @@ def _on_plane(shapes: Any, config: FileFireConfig, report: Report) -> Any:
 
 
 def _areas(shapes: Any) -> np.ndarray:
-    """Returns the polygons of shapes of one time; a closed line within another is an island.
-
-    Points, and open lines beside polygons, are left out.
-    """
+    """Returns the polygons of shapes of one time; a closed line within another is an island."""
     name = shapes.index[0]
     parts = shapely.get_parts(shapely.get_parts(shapes.to_numpy()))  # of collections of others
     found = parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]

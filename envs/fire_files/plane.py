@@ -22,6 +22,7 @@ class Plane(NamedTuple):
     about: str
     source: Any = None
     target: Any = None
+    unit: float = 1.0  # metres on the ground of a unit of length on the plane, where it is known
 
     def project(self, x: Any, y: Any, *, back: bool = False) -> tuple[Any, Any]:
         """Projects coordinates of the file onto the plane, or back."""
@@ -31,12 +32,6 @@ class Plane(NamedTuple):
 
         ends = (self.target, self.source) if back else (self.source, self.target)
         return Transformer.from_crs(*ends, always_xy=True).transform(x, y)
-
-    @property
-    def unit(self) -> float:
-        """Returns the metres of a unit of length on the plane, 1 if that is not known."""
-        axes = getattr(self.target or self.source, "axis_info", None)
-        return axes[0].unit_conversion_factor if axes else 1.0
 
 
 class Window(NamedTuple):
@@ -99,27 +94,29 @@ def choose_plane(crs: Any, wanted: str | None, bounds: Bounds) -> Plane:
     if source.is_geographic and not (in_degrees and size <= _MAX_DEGREES):
         seen = f"{where} are not the degrees of {source.name}, or too far apart for one UTM zone"
         raise ask(seen, "another fire.crs", "a file of the fire alone")
-    shape, ratio = _shape(source, source, bounds)
+    shape, ratio, unit = _shape(source, source, bounds)
     if not (crs and wanted) and ratio <= _BENT:
-        return Plane(f"projection {source.name} ({shape})", source)
+        return Plane(f"projection {source.name} ({shape})", source, unit=unit)
     zone: Any = GeoSeries([box(*bounds)], crs=source).estimate_utm_crs
     target = CRS.from_user_input(wanted) if crs and wanted else zone()
-    after, bent = _shape(target, source, bounds)
+    after, bent, unit = _shape(target, source, bounds)
     if bent > _BENT:
         raise ask(f"fire.crs={wanted} has {after} here", "one as UTM is")
     about = f"projection {source.name} ({shape}), projected to {target.name} ({after})"
-    return Plane(about, source, target)
+    return Plane(about, source, target, unit)
 
 
-def _shape(crs: Any, source: Any, bounds: Bounds) -> tuple[str, float]:
-    """Returns how a projection bends a small circle at the fire, as text, and the ratio of axes."""
+def _shape(crs: Any, source: Any, bounds: Bounds) -> tuple[str, float, float]:
+    """Returns how a small circle at the fire is bent, as text, the ratio of its axes, the unit."""
     from pyproj import Proj, Transformer
 
+    unit = crs.axis_info[0].unit_conversion_factor if crs.axis_info else 1.0
     if not crs.is_projected:  # degrees, or a plane of its own
-        return ("degrees", math.inf) if crs.is_geographic else ("a plane", 1.0)
+        return ("degrees", math.inf, 1.0) if crs.is_geographic else ("a plane", 1.0, unit)
     at = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
     to_degrees = Transformer.from_crs(source, source.geodetic_crs, always_xy=True)
     factors = Proj(crs).get_factors(*to_degrees.transform(*at), errcheck=True)
     ratio = float(factors.tissot_semimajor / factors.tissot_semiminor)
     turn = round(factors.meridian_convergence)
-    return f"axes {ratio:.2f} : 1, north turned by {turn} degrees", ratio
+    about = f"axes {ratio:.2f} : 1, north turned by {turn} degrees"
+    return about, ratio, unit / factors.tissot_semimajor

@@ -20,19 +20,11 @@ _MAX_CELLS = 50_000_000
 MAX_BANK = 300_000_000
 """Maximum number of cells of all fires of a bank: 1.2 GB."""
 _DRIVERS = {"tif": "GTiff", "nc": "netCDF", "asc": "AAIGrid"}
-_UNITS = {
-    "seconds": r"s|secs?|seconds?",
-    "minutes": r"mins?|minutes?",
-    "hours": r"h|hrs?|hours?",
-    "days": r"d|days?",
-    "day_of_year": r"days? of (the )?year|doy|julian days?",
-    "steps": r"steps?|time ?steps?",
-    "no unit of time": r"m|ft|feet|foot|met(er|re)s?|deg(ree)?s?|%|percent|.+/.+",
-}
 _SIDE = 30  # cells along a side of the paper's map
 _SKIPPED = 6000  # lines of the paper's text before step 0
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]])
 _NEVER = (-9999.0, -1.0)  # NODATA of FARSITE and FlamMap, and of ELMFIRE
+_Times = tuple[np.ndarray, Clock, str]
 _VOID = 1e30  # a number beyond it is NODATA although not declared, such as -3.4e38
 
 
@@ -136,12 +128,12 @@ def read_raster(
             if config.kind == "masks":
                 times, clock, what = _of_states(_read(dataset, MAX_BANK), config)
             else:
-                times, clock, what = _band(dataset, kind == "nc", config)
+                times, clock, what = _band(dataset, kind == "nc", config, report)
     nowhere = Plane("no place in the file: square cells, the first row in the north")
     fire = as_fire(times, clock, nowhere)
     if crs is not None or not np.allclose(affine, np.eye(3)):
         fire.matrix = affine
-        fire.plane = choose_plane(crs, config.crs, fire.bounds(None))
+        fire.plane = choose_plane(crs, config.crs, fire.bounds(fire.last))
     begin, end = clock.format(fire.first), clock.format(fire.last)
     burn = f"{np.isfinite(times).sum()} cells burn from {begin} to {end}"
     report.facts += [burn, what, fire.plane.about]
@@ -175,36 +167,37 @@ def _read(dataset: Any, most: int, band: int | None = None) -> np.ndarray:
     return dataset.read([band] if band else None)
 
 
-def _band(dataset: Any, last: bool, config: FileFireConfig) -> tuple[np.ndarray, Clock, str]:
+def _band(dataset: Any, last: bool, config: FileFireConfig, report: Report) -> _Times:
     """Returns the times of a raster's only band, or of the `last`, with what the band is."""
     band = dataset.count if last else 1
     if dataset.count != band:
         raise ask(f"{dataset.count} bands", "one", "maps of states with fire.kind=masks")
     tags = {name.lower(): text for name, text in (dataset.tags() | dataset.tags(band)).items()}
     titles = dataset.descriptions[band - 1], tags.get("long_name"), tags.get("netcdf_varname")
-    declared = (dataset.units[band - 1] or tags.get("units") or tags.get("unit") or "").strip()
+    told = (text for name, text in tags.items() if re.fullmatch("(time_?)?units?", name))
+    declared = (dataset.units[band - 1] or next(told, "")).strip()
     what = f"band {next((title for title in titles if title), band)!r:.60}"
     what += f", the last of {band} times" if band > 1 else ""
     what += f" ({declared})" if declared else ""
     values = _read(dataset, _MAX_CELLS, band)[0] * dataset.scales[band - 1]
     values, nodata = values + dataset.offsets[band - 1], dataset.read_masks(band) == 0
-    name, _, since = declared.partition(" since ")
-    known = next((u for u, form in _UNITS.items() if re.fullmatch(form, name, re.IGNORECASE)), None)
-    if known == "no unit of time":
-        raise ask(f"{what} is in {name[:20]}, {known}", "arrival times")
-    unit = decided_unit(known, config, what)
-    origin = in_utc(parse_dates([since.strip()], None, "units")[0]) if since else None
+    unit = decided_unit(declared, config, what, report)
+    since = declared.partition(" since ")[2].strip()
+    dated = re.search(r"\d", since)  # the time of ignition, for example, has no date
+    origin = in_utc(parse_dates([since], None, "units")[0]) if dated else None
     return *in_order(_arrival(values, config, nodata), unit, config, origin), what
 
 
-def _of_states(maps: np.ndarray, config: FileFireConfig) -> tuple[np.ndarray, Clock, str]:
+def _of_states(maps: np.ndarray, config: FileFireConfig) -> _Times:
     """Returns the number of the first map in which each cell is not unburnt."""
     states = np.unique(maps)
     listed = ", ".join(f"{state:g}" for state in states[:12])
-    if config.never is None and not np.isin(states, (0, 1, 2)).all():
-        some = "such as 'fire.unburned=[0,3,4,5]' of SimFire's with its lines"
-        raise ask(f"states {listed}", f"fire.unburned, those that are no fire, {some}")
     burns = ~np.isin(maps, (0,) if config.never is None else config.never)
+    odd, share = not np.isin(states, (0, 1, 2)).all(), burns[0].mean()
+    if config.never is None and (odd or share > 0.5):
+        some = "[0,3,4,5]' of SimFire's with its lines" if odd else "[0,1]' if 1 is a tree"
+        seen = f"states {listed}, not 0 in {share:.0%} of the first map"
+        raise ask(seen, f"fire.unburned, those that are no fire, such as 'fire.unburned={some}")
     times = np.where(burns.any(0), burns.argmax(0), np.inf)
     unit = config.units if config.units not in (None, "steps") else "maps"
     what = f"{len(maps)} maps of the states {listed}, rows from north to south"
@@ -228,13 +221,15 @@ def _array(path: Path, kind: str) -> np.ndarray:
 def _bank(fires: np.ndarray, config: FileFireConfig, horizon: int, report: Report) -> list[Raster]:
     """Returns fires in steps, [fires, X, Y], each a whole map."""
     count, columns, rows = fires.shape
-    if config.never is None and np.isfinite(fires[:: max(1, count // 8)]).all():
-        values, counts = np.unique(fires, return_counts=True)
+    full = (np.isfinite(fire).all() or np.mean(fire == 0) > 0.5 for fire in fires)
+    if config.never is None and any(full):
+        values, counts = np.unique(fires[np.isfinite(fires)], return_counts=True)
         most = np.argsort(-counts, kind="stable")[:6]
         listed = ", ".join(f"{values[k]:g} ({counts[k] / fires.size:.0%})" for k in sorted(most))
-        keys = [f"fire.unburned={values[most[0]]:g}", "fire.kind=masks", "fire.unburned=none"]
+        keys = [f"fire.unburned={values[most[0]]:.9g}", "fire.kind=masks", "fire.unburned=none"]
         states = len(values) <= 6 and (values % 1 == 0).all()
-        raise ask(f"{count} maps of the states {listed}, and no inf, never", *keys[int(states) :])
+        seen = f"{count} maps of the states {listed}, some without inf, never, or burning at first"
+        raise ask(seen, *keys[int(states) :])
     if config.units not in (None, "steps") and config.test is None:  # no other file has units
         raise ask(f"fire.units={config.units}: a bank is in steps", "none")
     report.facts.append(f"a bank of {count} fires of {columns} x {rows} cells, in steps")
@@ -265,25 +260,23 @@ def _front_points(path: Path, config: FileFireConfig, report: Report) -> Raster:
 def _arrival(
     values: np.ndarray, config: FileFireConfig, nodata: np.ndarray | None = None
 ) -> np.ndarray:
-    """Returns arrival times, inf in cells that never burn; asks about values that may be no times.
-
-    `nodata` is the file's mask; a bank has none: inf says there what never burns.
-    """
+    """Returns arrival times, inf for never; asks about negative ones, and plateaus of a file."""
     times = np.array(values, np.result_type(values, np.float32))
-    void = ~(np.abs(times) <= _VOID) | np.isin(times, (*_NEVER, *(config.never or ())))
+    never = np.array([*_NEVER, *(config.never or ())], times.dtype)
+    void = ~(np.abs(times) <= _VOID) | np.isin(times, never)
     times[void | (False if nodata is None else nodata)] = np.inf
     told, counts = np.unique(times[np.isfinite(times)], return_counts=True)
     odd = told < 0
     if config.never is None and nodata is not None:
         odd |= _plateaus(times, told, counts)
     if odd.any():
-        asked = [f"{value:g}" for value in told[odd][:6]]
+        asked = [f"{value:.9g}" for value in told[odd][:6]]
         shares = zip(asked, counts[odd] / counts.sum(), strict=False)
         listed = " and ".join(f"{value} ({share:.0%} of the cells)" for value, share in shares)
         others = f"{told[~odd].min():g} to {told[~odd].max():g}" if not odd.all() else "none"
         seen = f"{listed} may stand for cells that do not burn (others: {others})"
-        some = ",".join(asked)
-        key = f"'fire.unburned=[{some}]'" if len(asked) > 1 else f"fire.unburned={some}"
+        some = ",".join([*(f"{value:.9g}" for value in config.never or ()), *asked])
+        key = f"'fire.unburned=[{some}]'" if "," in some else f"fire.unburned={some}"
         none = () if (told < 0).any() else ("fire.unburned=none if they burn then",)
         raise ask(seen, key, *none)
     return times
@@ -298,12 +291,13 @@ def _plateaus(times: np.ndarray, told: np.ndarray, counts: np.ndarray) -> np.nda
     times, counts = np.where(times < 0, np.inf, times), np.where(told < 0, 0, counts)
     held = np.flatnonzero(counts)
     odd = (counts > counts.sum() / 2) & (len(held) > 1)
-    if len(held) > 3:
+    if len(held) > 2:
+        few = len(held) == 3  # of three values only, 0, 60 and 180 are times
         inner: Any = binary_erosion(np.isfinite(times))
         edge = times[np.isfinite(times) & ~inner]
         for at, (first, last) in ((held[0], held[[1, -1]]), (held[-1], held[[-2, 0]])):
-            far = abs(told[at] - told[first]) > abs(told[last] - told[first])
+            far = abs(told[at] - told[first]) > abs(told[last] - told[first]) * (10 if few else 1)
             rest = np.delete(counts, at).max()
-            often = counts[at] > max(0.1 * counts.sum(), 3 * rest)
+            often = not few and counts[at] > max(0.1 * counts.sum(), 3 * rest)
             odd[at] |= far or (often and (edge == told[at]).mean() > 0.5)
     return odd

@@ -1,8 +1,4 @@
-"""Reads the features of vector files, and chooses the features of one fire.
-
-GeoPackage, shapefile, GeoJSON, KML, CSV and folders of them become one table of geopandas, with its
-attributes as texts, empty where they are missing.
-"""
+"""Reads the features of vector files into one table of texts, and chooses those of one fire."""
 
 import gc
 import io
@@ -22,19 +18,22 @@ from geopandas import GeoDataFrame, points_from_xy
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.files import MAX_BYTES, damage, find_format, members
 from emberlink.envs.fire_files.report import ask
-from emberlink.envs.fire_files.times import FOLDERS, column_named, plain
+from emberlink.envs.fire_files.times import FOLDERS, column_named, date_within, plain
 from emberlink.envs.utils.errors import UserError, unknown
 from emberlink.envs.utils.validation import as_argument
 
 _SHAPES = ("Point", "LineString", "Polygon", "MultiGeometry")
 _DEGREES = "EPSG:4326"
-_MAYBE_ID = r"name|id|num|number|label|(f|fire|ig|ignition|event)?(year|yr)"
+_MAYBE_ID = r"name|nombre|nom|id|num|number|label|perim\w*id|(f|fire|ig|ignition|event)?(year|yr)"
+_FIRE = r"(incident|incid|inc|fire|event|burn|complex|cpx|cluster|merged?|case)s?"
 _ID = (
-    r"(poly|attr)?(incident|incid|fire|event|burn|complex|cluster|merged?)s?"
-    r"(name|nm|id|num|number|no|nr|code)?|fname|.*irwin.*|.*uniquefire.*"
+    rf"(poly|attr)?{_FIRE}|.*{_FIRE}(unique)?(na|nam|name|nm|id|ident|identifier|num|number|no|nr|code|desig)"
+    r"|fname|feu|.*irwin.*|.*uniquefire.*"
 )
 """Columns that identify a fire, by the letters of their names, or maybe features or times."""
-_MAYBE_KIND = r".*(class|kind|type|status)|type.*"
+_MAYBE_KIND = (
+    r".*(class|kind|type|status|symbol)|(type|tipo|kind|prescri|delete|isrx).*|layer|folder"
+)
 _KIND = r".*categ.*|(poly)?featu\w*"
 """Columns of kinds of features, or maybe descriptions of each."""
 
@@ -107,7 +106,7 @@ def _geojson(path: Path, _: str | None) -> Any:
         frame = frame.set_crs(None, allow_override=True)  # not as GeoJSON is defined
     about = {**whole, **(whole.get("properties") or {}), **(whole.get("metadata") or {})}
     taken = ("type", "name", *frame.columns)
-    more = {k: v for k, v in about.items() if isinstance(v, str | int) and k not in taken}
+    more = {k: v for k, v in about.items() if isinstance(v, str | int | float) and k not in taken}
     return frame.assign(**more)
 
 
@@ -157,29 +156,33 @@ def _placemarks(
 
 def choose_features(table: Any, config: FileFireConfig, facts: list[str]) -> Any:
     """Returns the features of one fire; notes on the others are appended to `facts`."""
-    for key, choose in (("where", _where), ("incident", _of_incident)):
+    where = " and ".join(config.conditions)
+    for key, choose in ((f"where={where}", _where), (f"incident={config.incident}", _of_incident)):
         kept = choose(table, config)
         if left_out := len(table) - len(kept):
-            facts.append(f"{left_out} left out by fire.{key}={getattr(config, key)}")
+            facts.append(f"{left_out} left out by fire.{key}")
         table = kept
     return table
 
 
 def _where(table: Any, config: FileFireConfig) -> Any:
     """Returns the features that `fire.where` keeps; asks if there are several kinds."""
-    if config.where is None and (several := _several(table, _KIND, _MAYBE_KIND)):
-        choice = as_argument("fire.where", f"{several[0]}={table[several[0]].mode().iloc[0]}")
-        seen = f"features of several kinds: {_counts(table, several[:1])}"
-        raise ask(seen, choice, "fire.where=* for all of them")
-    if config.where in (None, "*"):
+    given, decided = config.conditions, []
+    for condition in (text for text in given if text != "*"):
+        name, equals, pattern = condition.partition("=")
+        values = table[name := column_named(name, table, "fire.where")]
+        form = re.escape(pattern.strip()).replace(r"\*", ".*").replace(r"\|", "|")
+        kept = table[values.str.fullmatch(form, case=False) if equals else values != ""]
+        if kept.empty:
+            raise ask(f"fire.where={condition} keeps no feature", _counts(table, [name]))
+        table, decided = kept, [*decided, name]
+    several = _several(table.drop(columns=decided), _KIND, _MAYBE_KIND)
+    if "*" in given or not several:
         return table
-    name, equals, pattern = config.where.partition("=")
-    values = table[name := column_named(name, table, "fire.where")]
-    form = re.escape(pattern.strip()).replace(r"\*", ".*").replace(r"\|", "|")
-    kept = table[values.str.fullmatch(form, case=False) if equals else values != ""]
-    if kept.empty:
-        raise ask(f"fire.where={config.where} keeps no feature", _counts(table, [name]))
-    return kept
+    choice = f"{several[0]}={table[several[0]].mode().iloc[0]}"
+    every = f"{as_argument('fire.where', *given, '*')} for all of them"
+    seen = f"features of several kinds: {_counts(table, several[:1])}"
+    raise ask(seen, as_argument("fire.where", *given, choice), every)
 
 
 def _of_incident(table: Any, config: FileFireConfig) -> Any:
@@ -196,22 +199,25 @@ def _of_incident(table: Any, config: FileFireConfig) -> Any:
             values = sorted({*table[places].to_numpy().flat} - {""})[:30]
             raise UserError(f"fire.incident={unknown(str(wanted), values)}")
         table = table[is_it[chosen := is_it.any().idxmax()]]
-        other = f"fire.incident_field={chosen} beside fire.incident for all of these"
+        other = f"{as_argument('fire.incident_field', chosen)} beside fire.incident for all these"
     if (several := _several(table, _ID, _MAYBE_ID)) and not (wanted and field):
         answer = as_argument("fire.incident", next(filter(None, table[several[0]])))
         seen = f"{len(table)} features of several fires: {_counts(table, several)}"
-        raise ask(seen, f"fire.incident_field={several[0]} {answer}", other)
+        raise ask(seen, f"{as_argument('fire.incident_field', several[0])} {answer}", other)
     return table
 
 
 def _several(table: Any, sure: str, maybe: str) -> list[Any]:
-    """Returns the columns with several values; of columns that are unsure, not one per feature."""
-    return [
-        name
-        for name, count in table.replace("", None).nunique().items()
-        if (count > 1 and re.fullmatch(sure, plain(name)))
-        or (1 < count < len(table) and re.fullmatch(maybe, plain(name)))
-    ]
+    """Returns the columns with several values; of unsure ones, not dates or numbers of features."""
+    names = []
+    for name in table.columns[table.replace("", None).nunique() > 1]:
+        is_it = re.fullmatch(sure, plain(name)) is not None
+        if not is_it and re.fullmatch(maybe, plain(name)):
+            texts = table[name]
+            numbers = texts.is_unique and texts.str.contains(r"\d").any()
+            is_it = not (numbers or texts.map(date_within).all())
+        names += [name] if is_it else []
+    return names
 
 
 def _counts(table: Any, names: list[Any]) -> str:

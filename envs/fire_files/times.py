@@ -1,7 +1,4 @@
-"""Finds the times of features: elapsed or dates, in one column or more, or outside the table.
-
-Dates are read by strict patterns. If several fit, or several columns may hold them, it is asked.
-"""
+"""Finds the times of features, elapsed or dates, by strict patterns; asks if several fit."""
 
 import functools
 import re
@@ -17,17 +14,25 @@ from emberlink.envs.fire_files.report import SECONDS, Clock, Report, ask
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import as_argument
 
-_OUTSIDE = ("Name", "Folder", "File")
-"""Columns of what stands outside the attributes, and may hold a date: of KML, and of a folder."""
-FOLDERS = " > "
-"""Between the names of folders of KML, one within the other."""
+_OUTSIDE = ("Name", "Folder", "File")  # of KML and of a folder: beside the attributes, with dates
+FOLDERS = " > "  # between the names of folders of KML, one within the other
 _MAPPED = (
     r"(poly)?polygond\w*|polypolyg|perimeterd\w*|perdat\w*|gdbfromdat\w*|datetime|timestamp|tutc"
-    r"|acqdat\w*|validat|date|time|t|begin|elapsed\w*|seconds|minutes|hours|days"
+    r"|acqdat\w*|validat|date|fecha|datum|time|t|begin|elapsed\w*|seconds|minutes|hours|days"
 )
 """Columns of times by the letters and digits of their names, also cut to ten, as in a .dbf."""
-_HOUR, _MINUTE = r"(.*hours?|hora|heure|uhr|hr|h)(utc|gmt|z|local)?", r"min(ute)?s?"
-_OF_DAY = rf"{_HOUR}|{_MINUTE}|.*(time(utc|gmt|z|local)?|hhmm|clock|ampm)"
+_HOUR = r"(.*(hours?|hrs?)|(hora|heure|uhr)\w*|h)(utc|gmt|z|local)?"
+_MINUTE = r"min(ut\w*)?s?"
+_OF_DAY = rf"{_HOUR}|{_MINUTE}|.*(time(utc|gmt|z|local)?|hhmm|clock|ampm|zeit)"
+_UNITS = {
+    "seconds": r"s|secs?|seconds?",
+    "minutes": r"mins?|minutes?",
+    "hours": r"h|hrs?|hours?",
+    "days": r"d|days?",
+    "day_of_year": r"days? of (the )?year|doy|julian days?",
+    "steps": r"steps?|time ?steps?",
+    "no unit of time": r"m|ft|feet|foot|met(er|re)s?|deg(ree)?s?|%|percent|.+/.+",
+}
 _MIDNIGHT = r"[T ](00:00(:00)?([.]0+)?|12:00(:00)? AM)(Z|[+]00(:?00)?)?$"
 _DAYS = ("%Y-%m-%d", "%Y-%j", "%d-%b-%Y", "%d-%b-%y", "%b-%d-%Y", "%Y%m%d")
 """Patterns of days; - is any separator."""
@@ -47,23 +52,26 @@ _DIGITS = {
     14: ("%Y%m%d%H%M%S",),
 }
 """Patterns of texts of digits, by their length; 0 for other texts."""
-_ZONES = {"Z": "+0000", "UTC": "+0000", "GMT": "+0000", "UT": "+0000"}
-_ZONES |= {"EST": "-0500", "EDT": "-0400", "CST": "-0600", "CDT": "-0500", "MST": "-0700"}
-_ZONES |= {"MDT": "-0600", "PST": "-0800", "PDT": "-0700", "AKST": "-0900", "AKDT": "-0800"}
-"""Zones of RFC 2822 and of Alaska."""
+_ZONES = """Z+0000 UTC+0000 GMT+0000 UT+0000 WET+0000 BST+0100 CET+0100 CEST+0200 EET+0200 EEST+0300
+AWST+0800 ACST+0930 AEST+1000 ACDT+1030 AEDT+1100 NZST+1200 NZDT+1300 HST-1000 AKST-0900 AKDT-0800
+PST-0800 PDT-0700 MST-0700 MDT-0600 CST-0600 CDT-0500 EST-0500 EDT-0400"""
+_OFFSETS = dict(re.findall(r"(\w+)([+-]\d+)", _ZONES))
+_ZONE = "|".join([*sorted(_OFFSETS, key=len)[::-1], "local|(?-i:L|(?!HEAT|SPOT)[A-Z]{1,3}T)"])
+"""Zones, and what may be one that is not known, so that its time is refused."""
 _MONTH = r"(?:jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*\.?"
 _DATE = re.compile(
     r"(?<!\d)(?:(?:mon|tue|wed|thu|fri|sat|sun)[a-z]*[,.]?\s*)?(?P<day>(?:19|20)\d{6}"
-    r"|\d{4}([-/.])\d\d?\2\d\d?|\d{4}-?\d{3}|\d\d?([-/.])\d\d?\3(?:\d{4}|\d\d)"
+    r"|(?:19|20)\d\d([-/. ])\d\d?\2\d\d?|\d{4}-?\d{3}|\d\d?([-/.])\d\d?\3(?:\d{4}|\d\d)"
     rf"|\d\d?(?:st|nd|rd|th)?[-\s]?{_MONTH}[-,\s]*(?:\d{{4}}|\d\d)"
     rf"|{_MONTH}[-\s]+\d\d?(?:st|nd|rd|th)?,?\s+\d{{4}})"
-    r"(?:(?:T|,?[\s-]+(?:at\s+)?)(?P<hour>\d\d?)(?=:?\d\d|\s?[ap]\.?m)(?::?(?P<minute>\d\d))?"
-    r"(?::?(?P<second>\d\d)(?:[.,]\d+)?)?(?:\s?(?P<half>[ap])\.?m\.?)?"
-    rf"(?:\s?(?P<zone>{'|'.join(sorted(_ZONES, key=len, reverse=True))})\b)?"
-    r"(?:\s?(?P<sign>[+-])(?P<hours>\d\d?)(?::?(?P<minutes>\d\d))?)?(?:\s?\([^)]*\))?)?(?!\d)",
+    r"(?:(?:T|,?[\s-]+(?:(?:at|@)\s*)?|(?<=\d{8})(?=\d{4}))(?P<hour>\d\d?|(?=[ap]\.?m\b))"
+    r"(?=[:h]?\d\d|\s?[ap]\.?m)(?:[:h]?(?P<minute>\d\d))?(?::?(?P<second>\d\d)(?:[.,]\d+)?)?"
+    rf"(?:\s?(?P<half>[ap])\.?m\.?)?(?:\s?h(?:ou)?rs?\b)?(?:\s?\(?(?P<zone>{_ZONE})\b\)?)?"
+    r"(?:\s?(?P<sign>[+-])(?P<hours>[01]?\d)(?::?(?P<minutes>\d\d))?(?:\s?\([^)]*\))?)?)?(?!\d)",
     re.IGNORECASE,
 )
-"""A day, with or without a time of day and its zone."""
+"""A day, with or without a time of day, or a half of the day, and its zone."""
+_APART = r"((?:19|20)\d\d[- ]?\d\d[- ]?\d\d[T -]\d\d)((?:[-.h ]\d\d){1,2})(?!\d)"
 
 
 def plain(name: Any) -> str:
@@ -89,19 +97,20 @@ def read_times(
         table = table.assign(**{name: table[name].map(date_within) for name in loose})
     names = _columns(table, config.time_field)
     if len(empty := table.index[(table[names] == "").any(axis=1)]):
+        key = as_argument("fire.where", *config.conditions, names[0])
         seen = f"{empty[0]} has no time in {names[0]} ({len(empty)} of {len(table)})"
-        raise ask(seen, "one in each", f"fire.where={names[0]} to leave out those without")
+        raise ask(seen, "one in each", f"{key} to leave out those without")
     texts = table[names[0]]
     if len(names) == 1 and config.time_format is None and not all(map(is_date, texts.unique())):
         numbers = texts.str.extract(r"^(\d+(?:\.\d*)?(?:e[-+]?\d+)?)$", expand=False).astype(float)
         if numbers.notna().all():
-            return _elapsed(numbers.to_numpy(), names[0], config, report)
+            return _elapsed(numbers.to_numpy(), names[0], table, config, report)
     if config.time_field is None and not _has_clock(
-        parse_dates(texts, config.time_format, names[0])
+        parse_dates(texts, config.time_format, names[0], table.index)
     ):
         names += _clocks_beside(table, names[0])
     title = " and ".join(map(str, names))
-    dates = parse_dates(_joined(table, names), config.time_format, title)
+    dates = parse_dates(_joined(table, names), config.time_format, title, table.index)
     naive = {date.tzinfo is None for date in dates}
     if len(naive) > 1:
         raise ask(f"{title}: some times have a zone and others have none", "one in all")
@@ -122,11 +131,13 @@ def read_times(
 
 
 def _elapsed(
-    values: np.ndarray, name: str, config: FileFireConfig, report: Report
+    values: np.ndarray, name: str, table: Any, config: FileFireConfig, report: Report
 ) -> tuple[np.ndarray, Clock]:
     about = f"{name} ({values.min():g} to {values.max():g})"
-    known = (u for u in SECONDS if re.fullmatch(rf"elapsed{u[:2]}\w*|{u}", plain(name)))
-    unit = decided_unit(next(known, None), config, about)
+    told = [u for u in SECONDS if re.fullmatch(rf"elapsed{u[:2]}\w*|{u}", plain(name))]
+    for column in table if not told else ():
+        told = table[column].unique() if re.fullmatch("(time)?units?", plain(column)) else told
+    unit = decided_unit(told[0] if len(told) == 1 else "", config, about, report)
     report.facts.append(f"times from {name}")
     return in_order(values, unit, config)
 
@@ -144,23 +155,33 @@ def _columns(table: Any, given: str | Sequence[str] | None) -> list[Any]:
     if not found or table[found].ne(table[found[0]], axis=0).any(axis=None):
         maybe = found or [*dated, *(name for name in filled if name not in dated)][:15]
         seen = ", ".join(f"{name} ({table[name].iloc[0][:30]})" for name in maybe)
-        key = as_argument("fire.time_field", maybe[0]) if maybe else "a column of times"
+        fields = maybe[:1] or ["COLUMN"]
+        if fields[0] in dated and ":" not in table[fields[0]].iloc[0]:
+            fields += _clocks(table.drop(columns=fields))
+        key = as_argument("fire.time_field", *fields)
         raise ask(f"which column holds the times: {seen or 'none'}?", f"{key} or such")
     return found[:1]
 
 
 def _clocks_beside(table: Any, date: Any) -> list[Any]:
     """Returns the column of times of day named as that of the dates; asks about others."""
-    names = []
-    for name in table.columns.drop(date):
-        values = table[name][table[name] != ""]
-        clock = values.str.match(r"\d{1,6}\b|\d\d?:\d\d").any()
-        half = len(values) > 0 and values.str.fullmatch(r"(?i)[ap]\.?m\.?").all()
-        names += [name] if half or (clock and re.fullmatch(_OF_DAY, plain(name))) else []
+    names = _clocks(table.drop(columns=date))
     if names and (len(names) > 1 or plain(date).replace("date", "time") != plain(names[0])):
-        key = f"'fire.time_field=[{','.join([date, *names])}]' to join them"
+        key = f"{as_argument('fire.time_field', date, *names)} to join them"
         seen = f"{date} has no times of day, maybe {', '.join(names)} has"
-        raise ask(seen, key, f"fire.time_field={date}")
+        raise ask(seen, key, as_argument("fire.time_field", date))
+    return names
+
+
+def _clocks(table: Any) -> list[Any]:
+    """Returns the columns that may hold times of day, by their names or by all of their values."""
+    names = []
+    for name in table:
+        values = table[name][table[name] != ""]
+        form = r"(?i)\d\d?[:h]\d\d|[ap]\.?m\b"
+        if re.fullmatch(_OF_DAY, plain(name)) and values.str.match(r"\d{1,6}(?i:z|h|\b)").any():
+            form = ""
+        names += [name] if len(values) and values.str.match(form).all() else []
     return names
 
 
@@ -175,10 +196,9 @@ def _joined(table: Any, names: Sequence[Any]) -> Any:
             continue
         if re.fullmatch(_HOUR, title):
             part = part.str.replace(r"^(\d\d?)$", r"\1:00", regex=True)
-        part = part.str.replace(r"^\d{1,3}$", lambda few: few[0].zfill(4), regex=True)
-        if name == names[1]:  # AM or PM alone begins a half of the day
-            part = part.str.replace(r"(?i)^(?=[ap]\.?m)", "12 ", regex=True)
-        joined += " " + part
+        if title not in ("month", "day"):
+            part = part.str.replace(r"^\d{1,3}$", lambda few: few[0].zfill(4), regex=True)
+        joined += " " + part.str.replace(r"(?i)^([ap]\.?m)\b.*", r"\1", regex=True)  # AM flight
     return joined
 
 
@@ -190,9 +210,15 @@ def _nested(shapes: Any) -> bool:
     return bool((sizes[inner] < 0.9 * sizes[outer]).any())
 
 
-def decided_unit(known: str | None, config: FileFireConfig, what: str) -> str:
+def decided_unit(declared: str, config: FileFireConfig, what: str, report: Report) -> str:
     """Returns the unit of the file or of the key; asks if there is none or they differ."""
+    form = r"({})[.]?( *[(].*| (since|after|from) .*)?"
+    units = (u for u in _UNITS if re.fullmatch(form.format(_UNITS[u]), declared, re.IGNORECASE))
+    if (known := next(units, None)) == "no unit of time":
+        raise ask(f"{what} is in {declared[:20]}, {known}", "arrival times")
     unit = config.units or known
+    if declared and known is None and unit is not None:
+        report.doubts.append(f"{what} is in {declared[:20]!r}, read as {unit}")
     if unit is None:
         some = "fire.units=minutes (FARSITE, FlamMap), seconds (ELMFIRE, WRF-SFIRE) or such"
         raise ask(f"the unit of {what} is not known", some)
@@ -212,6 +238,8 @@ def in_order(
         first = days[(last + 1) % len(days)]
         cyclic = days[0] >= 1 and days[-1] <= 366 and (days % 1 == 0).all()
         if unit == "day_of_year":
+            if days[-1] > 366:
+                raise ask(f"{days[-1]:.9g} is no day of the year", "1 to 366")
             values = np.where(values < first, values + gaps.sum(), values)
         elif config.start is None and cyclic and last < len(days) - 1 and gaps[last] > 183:
             seen = f"days {days[0]:g} to {days[last]:g} and {first:g} to {days[-1]:g}"
@@ -220,13 +248,14 @@ def in_order(
     return values, Clock(unit, origin)
 
 
-def parse_dates(texts: Sequence[str], form: str | None, key: str) -> list[datetime]:
+def parse_dates(texts: Sequence[str], form: str | None, key: str, rows: Any = ()) -> list[datetime]:
     """Reads calendar times in one format: `form`, which is `fire.time_format`, or the only fit."""
     distinct = [*dict.fromkeys(texts)]
     fits = _fits(distinct, form)
     if not fits:
         wrong = next((text for text in distinct if not _fits([text], form)), distinct[0])
-        raise ask(f"{key}={wrong[:40]!r} is not a date", "such as fire.time_format=%d.%m.%Y")
+        place = dict(zip(texts, map("{}: ".format, rows), strict=False)).get(wrong, "")
+        raise ask(f"{place}{key}={wrong[:40]!r} is not a date", "its pattern in fire.time_format")
     if len({tuple(map(in_utc, dates)) for dates in fits.values()}) > 1:
         listed = " or ".join(f"{name} ({read[0]:%Y-%m-%d %H:%M})" for name, read in fits.items())
         keys = map("fire.time_format={}".format, fits)
@@ -237,7 +266,8 @@ def parse_dates(texts: Sequence[str], form: str | None, key: str) -> list[dateti
 
 def _fits(texts: Sequence[str], form: str | None) -> dict[str, list[datetime]]:
     """Reads texts by the pattern `form`, or by each that may fit them all, by their digits."""
-    lengths = {len(text) if text.isdecimal() else 0 for text in texts}
+    wholes = (re.sub(r"[.]\d+$", "", text) for text in texts)
+    lengths = {len(whole) if whole.isdecimal() else 0 for whole in wholes}
     fits = {}
     for name in (form,) if form else _DIGITS.get(max(lengths), ()) if len(lengths) == 1 else ():
         with suppress(ValueError, OverflowError, OSError):
@@ -255,7 +285,7 @@ def date_within(text: str) -> str:
     for part in reversed(text.split(FOLDERS)):
         if is_date(part):
             return part
-        part = re.sub(r"(\d\d-\d\d[T ]\d\d)[-.h](\d\d)(?!\d)", r"\1:\2", part.replace("_", " "))
+        part = re.sub(_APART, lambda m: m[1] + re.sub(r"\D", ":", m[2]), part.replace("_", " "))
         found = {match.group() for match in _DATE.finditer(part)}
         if len(found) == 1:
             return found.pop()
@@ -284,12 +314,13 @@ def _read(text: str, form: str) -> datetime:
         raise ValueError(text)
     part = {name: found or "" for name, found in match.groupdict().items()}
     day = "-".join(re.findall(r"\d+|(?<![a-z])[a-z]{3}", part["day"].lower()))
-    zone = _ZONES.get(part["zone"].upper(), "")
+    zone = _OFFSETS.get(part["zone"].upper(), part["zone"])
     if part["sign"]:
         zone = f"{part['sign']}{part['hours']:0>2}{part['minutes']:0>2}"
-    clock = f"{part['hour']:0>2}{part['minute']:0>2}{part['second']:0>2}{part['half']}"
-    clocks = f"{'%I%M%S%p' if part['half'] else '%H%M%S'}{'%z' if zone else ''}"
-    clock += "m" * bool(part["half"]) + zone
+    half = part["half"] and f"{part['half']}m"
+    clock = f"{part['hour'] or '12' * bool(half):0>2}{part['minute']:0>2}{part['second']:0>2}"
+    clock, clocks = f"{clock}{half}{zone}", "%I%M%S%p" if half else "%H%M%S"
+    clocks += "%z" * bool(zone)
     for pattern in (*_DAYS, *_ORDERS.get(form, ())):
         with suppress(ValueError):
             return datetime.strptime(f"{day} {clock}", f"{pattern} {clocks}")

@@ -1,22 +1,38 @@
 """Second cases: one file of each kind of misreading gives its question, and the answer its grid."""
 
+import functools
 import re
 
 import numpy as np
 import pytest
 import torch
 from fire_files import Ellipses, answered, raster_of, squares, write_asc, write_tif
+from rasterio.transform import from_origin
 
 TIMES = raster_of(Ellipses(), 300.0)
 BURNS = TIMES >= 0
+FILLS = np.where(np.arange(100)[:, None] < 5, -2, np.where(BURNS, 200 + TIMES // 60, 0))
+CORNER = np.pad(np.arange(400.0).reshape(20, 20), ((5, 75), (70, 10)), constant_values=-1)
 DAYS = [f"2020-08-{day:02}" for day in (20, 21, 22)]
-KML = "<kml><Document>{}</Document></kml>"
+PARTS = {"year": [2020] * 3, "month": [9] * 3, "day": [5] * 3, "hour": [9, 10, 11]}
+SINUSOIDAL = {"crs": "+proj=sinu +R=6371007.181", "transform": from_origin(0, 5.56e6, 1e4, 1e4)}
+UNITS = ("min.", "Minutes (elapsed)", "minutes since ignition")
+STATUS = ("status", "PrescribedFire", "Tipo", "Layer", "DeleteThis", "Folder")
 
 
-def table(name, **columns):
+def table(sides=(200, 300, 400), **columns):
     def write(folder):
-        squares(200, 300, 400, **columns).to_file(folder / name)
-        return folder / name
+        squares(*sides, **columns).to_file(folder / "fire.gpkg")
+        return folder / "fire.gpkg"
+
+    return write
+
+
+def names(*stems):
+    def write(folder):
+        for stem, side in zip(stems, (200, 300, 400), strict=True):
+            squares(side).to_file(folder / f"{stem}.geojson")
+        return folder
 
     return write
 
@@ -25,20 +41,9 @@ def raster(values, **about):
     return lambda folder: write_tif(folder / "fire.tif", values, **{"nodata": None, **about})
 
 
-def in_names(folder):
-    areas = squares(200, 300, 400).to_crs("EPSG:4326").geometry
-    marks = ""
-    for day, area in enumerate(areas, 5):
-        ring = " ".join(f"{x},{y}" for x, y in area.exterior.coords)
-        marks += f"<Placemark><name>Creek 0{day}/08/2020</name><LinearRing><coordinates>{ring}"
-        marks += "</coordinates></LinearRing></Placemark>"
-    (folder / "fire.kml").write_text(KML.format(marks))
-    return folder / "fire.kml"
-
-
-def states(folder):
+def states(folder, unburnt=0):
     maps = np.stack([BURNS & (time >= TIMES) for time in range(0, 301, 20)]).astype("uint8")
-    return write_tif(folder / "fire.tif", maps, nodata=None)
+    return write_tif(folder / "fire.tif", maps + np.uint8(unburnt), nodata=None)
 
 
 def arcinfo(folder):
@@ -52,45 +57,69 @@ def arcinfo(folder):
 def bank(folder):
     fires = np.full((2, 20, 20), 9999, "f4")
     fires[:, 4:16, 4:16] = np.arange(144).reshape(12, 12)
+    fires[0, 0, 0] = np.inf
     np.save(folder / "fire.npy", fires)
     return folder / "fire.npy"
 
 
-# How the file is written, keys, the question if there is one, and what `read:` says at last.
+FILES = {
+    "1 flights": table(date=[DAYS[0], *DAYS[:2]], flight=["am flight", "pm flight", "am IR"]),
+    "1 halves": names("2020-09-05 AM", "2020-09-05 PM", "2020-09-06 AM"),
+    "1 parts": table(**PARTS),
+    "2 one each": table(date=DAYS, name=["Alder", "Birch", "Cedar"]),
+    "2 words": table(date=DAYS, **{"Fire Name": ["True", "True", "False"]}),
+    **{f"3 {name}": table(date=DAYS, **{name: ["No", "No", "Yes"]}) for name in STATUS},
+    "4 in a corner": raster(CORNER, **SINUSOIDAL),
+    "5 fills": raster(FILLS.astype("int16")),
+    "5 lit": raster(np.where(BURNS, np.maximum(TIMES - 150, 0), -9999), nodata=-9999.0),
+    "5 three values": raster(np.kron([[1, 2, 9999.0]], np.ones((30, 10)))),
+    "5 three times": raster(np.kron([[0, 60, 180.0]], np.ones((30, 10)))),
+    "5 of a bank": bank,
+    "6 over New Year": table(doy=[364, 365, 1]),
+    "6 years": raster(np.where(BURNS, 2020358 + TIMES // 60, -9999)),
+    "7 zones": names(*(f"IR_202008{day}2130 CEST" for day in (20, 21, 22))),
+    "7 no zone": names(*(f"IR 2020-08-{day} 21:30 BRT" for day in (20, 21, 22))),
+    "7 start": table(date=["13.09.2020", "14.09.2020", "15.09.2020"]),
+    **{f"8 {u}": raster(TIMES, nodata=-9999.0, tags={"TIME_UNITS": u}) for u in UNITS},
+    "8 column": table(t=[0, 60, 120], units=["min"] * 3),
+    "9 states in bands": states,
+    "9 trees": functools.partial(states, unburnt=1),
+    "11 union": table((200, 400, 300), date=DAYS),
+    "13 ArcInfo": arcinfo,
+}
+# Keys, the question if there is one, and what `read:` says at last.
 CASES = {
-    "1 flights of a day": (
-        table("fire.gpkg", date=[DAYS[0], DAYS[0], DAYS[1]], flight=["AM", "PM", "AM"]),
-        ({}, r"fire.time_field=\[date,flight\]", "3 times, from 2020-08-20T00:00"),
-    ),
-    "3 status": (
-        table("fire.geojson", date=DAYS, status=["final", "final", "draft"]),
-        ({}, r"status: final \(2\), draft \(1\)", "2 of 3 features used"),
-    ),
-    "5 end and five seconds": (
-        raster(np.where(BURNS, TIMES, 305)[25:75, 25:75]),
-        ({"units": "seconds"}, r"305 \(75 ?% ", "seconds to 298.853"),
-    ),
-    "5 of a bank": (bank, ({}, r"9999 \(64 ?%", "a bank of 2 fires .* 101 of 20 x 20")),
-    "6 over New Year": (
-        table("fire.gpkg", doy=[364, 365, 1]),
-        ({"time_field": "doy", "units": "days"}, "units=day_of_year", "364 days to 366 days"),
-    ),
-    "9 states in bands": (states, ({}, "15|16 bands; .*fire.kind=masks", "to 15 maps")),
-    "11 shrinking": (
-        table("fire.gpkg", date=[DAYS[2], DAYS[1], DAYS[0]]),
-        ({}, "no fire spreads", ""),
-    ),
-    "12 names": (in_names, ({}, "fits day_first", "times from Name")),
-    "13 ArcInfo": (arcinfo, ({"units": "minutes"}, "", "axes 1.21 : 1.* projected to")),
+    "1 flights": ({}, r"fire.time_field=\[date,flight\]", "3 times, from 2020-08-20T00:00"),
+    "1 halves": ({}, "", "3 times, from 2020-09-05T00:00.* to 2020-09-06T00:00"),
+    "1 parts": ({"time_field": [*PARTS]}, "", "from 2020-09-05T09:00.*T11:00"),
+    "2 one each": ({}, r"name: Alder \(1\), .*fire.incident=Alder", ""),
+    "2 words": ({}, r"Fire Name: True \(2\)", "2 of 3 features used"),
+    **{f"3 {name}": ({}, rf"{name}: No \(2\), Yes \(1\)", "2 of 3 features") for name in STATUS},
+    "4 in a corner": ({"units": "days"}, "", "axes 1.15.* projected to"),
+    "5 fills": ({"units": "day_of_year"}, r"-2 \(5 ?% .* and 0 .*\[-2,0\]", "200 days to 204"),
+    "5 lit": ({"units": "minutes"}, "", "from 0 minutes to 149"),
+    "5 three values": ({"units": "hours"}, "9999 ", "600 cells"),
+    "5 three times": ({"units": "minutes"}, "", "900 cells"),
+    "5 of a bank": ({}, r"9999 \(64 ?%", "a bank of 2 fires .* 101 of 20 x 20"),
+    "6 over New Year": ({"time_field": "doy", "units": "days"}, "day_of_year", "364 days to 366"),
+    "6 years": ({"units": "day_of_year"}, "2020362 is no day of the year", ""),
+    "7 zones": ({}, "", "from 2020-08-20T19:30.*times from File, zone of the file"),
+    "7 no zone": ({}, r"T.geojson: feature 0: File='2020-08-20 21:30 BRT' is not a date", ""),
+    **{f"8 {unit}": ({"units": "hours"}, "fire.units=minutes, not", "723 cells") for unit in UNITS},
+    "8 column": ({"units": "hours"}, "fire.units=minutes, not hours", "to 120 minutes"),
+    "7 start": ({"time_format": "%d.%m.%Y", "start": "2020-09-13T10:30"}, "", "3 times"),
+    "9 states in bands": ({}, "15|16 bands; .*fire.kind=masks", "to 15 maps"),
+    "9 trees": ({"kind": "masks"}, r"100% of the first map.*=\[0,1\]", "to 15 maps"),
+    "11 union": ({}, "", "1 without all that burnt before: the union counts"),
+    "13 ArcInfo": ({"units": "minutes"}, "", "axes 1.21 : 1.* projected to"),
 }
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_second_case(name, tmp_path):
-    write, (keys, question, says) = CASES[name]
-    path = write(tmp_path)
-    fires, about, questions = answered(path, keys)
-    assert bool(questions) == bool(question)
+    keys, question, says = CASES[name]
+    fires, about, questions = answered(FILES[name](tmp_path), keys)
+    assert bool(questions) == bool(question), questions
     assert re.search(question, (*questions, "")[0])
     assert re.search(says, about), (about, questions)
     assert not says or torch.isfinite(fires).sum() > 100

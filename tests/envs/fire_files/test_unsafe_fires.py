@@ -151,7 +151,7 @@ def test_parts_of_a_shapefile(wholes):
     table.write_bytes(content[: len(content) // 2])
     refused(wholes[".shp"], "fread.*expected perimeters in front.shp")
     table.unlink()
-    refused(wholes[".shp"], "which column holds the times: none")
+    refused(wholes[".shp"], "which column holds the times: none.*fire.time_field=")
 
 
 def test_values_that_are_no_times(tmp_path):
