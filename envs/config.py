@@ -50,7 +50,8 @@ class RadioConfig:
     delay: Annotated[int, Field(ge=0, le=1000)] = 0
     """steps from sending a message to receiving it"""
     bandwidth: Annotated[int, Field(ge=0, le=1_000_000_000)] | None = None
-    """bytes that a UAV can say in a step, with a base half of them to it; None for no limit"""
+    """bytes that a UAV can say in a step, half of them to the base if there is one; None for no
+    limit"""
     shared: bool = False
     """whether radios in range of each other share the bandwidth"""
 

@@ -53,7 +53,7 @@ def measured(policy: str, settings: list[str]) -> dict:
 
 def draw(found: dict, policies: list[str], changes: list[str], path: Path) -> None:
     """Draws a row for each policy and a panel for each limit of bytes."""
-    first = next(iter(found.values()))
+    first = found[policies[0], *changes, *OFF]
     plot = Figure(figsize=(4 * len(BYTES), 3.4 * len(policies)), layout="constrained")
     plot.suptitle(f"gain and value of messages in {first['headline']}, world {first['world']}")
     panels = plot.subplots(len(policies), len(BYTES), squeeze=False)

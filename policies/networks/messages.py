@@ -68,7 +68,7 @@ class Messages(nn.Module):
                 (column).
         """
         message, key = self.arrive(message), self.arrive(key)
-        weights = self.weights(features, key, hears) * hears
+        weights = self.weights(features, key, hears).masked_fill(~hears, 0.0)
         return self.grouping.split(weights.to(message.dtype) @ message, hears.shape[:2])
 
     def arrive(self, said: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Measures the CPU seconds of a training: its updates, and everything else."""
+"""Measures a training: its updates, everything else, and what single settings save."""
 
 import time
 from functools import partial

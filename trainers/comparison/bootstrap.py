@@ -82,12 +82,11 @@ def interval(
     *samples: Sequence[float] | Values,
     axis: int = -1,
     resamples: int = RESAMPLES,
-    paired: bool = False,
 ) -> Any:
     """Returns both ends of the 95 % percentile bootstrap interval of a statistic.
 
-    `samples` hold one number per run along `axis`, for each method; `paired` if entry i of all is
-    drawn together, such as of one fire. None if there is only one run, or an end is not finite.
+    `samples` hold one number per run along `axis`, for each method. None if there is only one run,
+    or an end is not finite.
     """
     values = [np.asarray(sample, float) for sample in samples]
     if min(sample.shape[axis] for sample in values) < 2:
@@ -97,7 +96,6 @@ def interval(
         ends = stats.bootstrap(
             values,
             statistic,
-            paired=paired,
             axis=axis,
             n_resamples=resamples,
             batch=1000,
@@ -116,7 +114,7 @@ def crossed_interval(
 
     `samples` are [seeds, fires] for each training. Each resample draws fires, the same for all, and
     seeds within each; a run's number is its mean over the drawn fires. This interval describes
-    another training on other fires; one over fires alone, without `seeds`, the networks at hand.
+    another training on other fires; without `seeds`, where only fires are drawn, the networks.
     None if there is only one fire or, for `seeds`, one seed, or an end is not finite.
     """
     if min(sample.shape[not seeds] for sample in samples) < 2:

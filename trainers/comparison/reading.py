@@ -137,7 +137,10 @@ def read(path: Path) -> EvaluatedRun:
 def read_evaluation(file: Path) -> Evaluation:
     """Returns the content of an eval.json."""
     with naming(file):
-        return from_plain(Evaluation, json.loads(read_text(file, MAX_JSON)))
+        evaluation = from_plain(Evaluation, json.loads(read_text(file, MAX_JSON)))
+        if not all(LEARNED in played for played in evaluation.results.values()):
+            raise UserError("has no results of the policy")
+        return evaluation
 
 
 def evaluated_otherwise(run: EvaluatedRun, file: Path) -> list[EvaluatedRun]:

@@ -217,7 +217,9 @@ def to_evaluate(
     text = fspath(policy) if isinstance(policy, str | PathLike) else ""
     if method is None and text and not name and not is_reference(text):
         return load(text, overrides, checkpoint=checkpoint, device=device, **settings), None
-    if method is None or checkpoint is not None:
+    if checkpoint is not None:
+        raise UserError(f"{checkpoint} is a checkpoint: expected a run, and no method and no name")
+    if method is None:
         raise UserError(
             f"{text or 'evaluate'}: expected emberlink eval POLICY METHOD [key=value ...] --name "
             "NAME, or evaluate(POLICY, METHOD, ...); METHOD says which observations it reads"

@@ -96,10 +96,10 @@ def mean_difference(first, second, axis=-1):
     return first.mean(axis) - second.mean(axis)
 
 
-def test_the_paired_interval_draws_fires_together():
-    first = np.array([1.0, 2.0, 3.0, 4.0])
-    assert interval(mean_difference, first, first + 1, paired=True) == (-1.0, -1.0)
-    assert interval(mean_difference, first[:1], first[:1], paired=True) is None
+def test_the_interval_over_fires_draws_them_together():
+    first = np.array([[1.0, 2.0, 3.0, 4.0]])
+    assert crossed_interval(mean_difference, first, first + 1, seeds=False) == (-1.0, -1.0)
+    assert crossed_interval(mean_difference, first[:, :1], first[:, :1], seeds=False) is None
 
 
 def test_the_crossed_interval_draws_seeds_and_the_same_fires():
@@ -130,7 +130,7 @@ def test_the_crossed_interval_contains_the_truth_in_about_95_of_100_simulations(
         )  # fmt: skip
         low, high = crossed_interval(iqm_difference, first, second) or (0, 0)
         inside += low <= 0 <= high
-        fires = interval(mean_difference, first.mean(0), second.mean(0), paired=True, resamples=500)
+        fires = crossed_interval(iqm_difference, first, second, seeds=False) or (0, 0)
         alone += fires[0] <= 0 <= fires[1]
     assert 92 <= inside <= 100
     assert alone < 90
