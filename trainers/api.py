@@ -122,10 +122,10 @@ def evaluate(
     """Evaluates a frozen policy on test fires.
 
     Args:
-        policy: a run, see `load`, of which no file is written; or with `method` also a
+        policy: a run, see `load`, whose folder stays as it is; or with `method` also a
             TensorDictModule, an `nn.Module`, a function (`foreign.ForeignPolicy`), or a text
             `module:NAME`, `file.py:NAME` or `file.onnx`.
-        method: the method whose observations the policy reads. `settings` are then those of
+        method: the method whose observations the policy reads. With it, `settings` are the keys of
             `train` (`setup`, `world`, `fire`, `seed`, ...).
         name: with `method`: writes a run folder in `output`, which `compare` reads and calls by
             this name; later commands can open the policy if it was given as a text.

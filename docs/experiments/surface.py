@@ -97,9 +97,9 @@ def main(name: str, *words: str) -> None:
                 with path.open("a") as file:
                     file.write(json.dumps(found[played]) + "\n")
     finally:
-        off = {played for played in found if played[1:] == (*changes, *OFF)}
-        if drawn := dict.fromkeys(played[0] for played in found if played in off):
-            draw(found, [*drawn], changes, Path(f"{name}.png"))
+        off = (*changes, *OFF)
+        if drawn := [policy for policy, *settings in found if (*settings,) == off]:
+            draw(found, drawn, changes, Path(f"{name}.png"))
 
 
 main(*sys.argv[1:])

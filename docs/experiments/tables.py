@@ -83,8 +83,9 @@ def cell(row: str, column: str) -> str:
     texts = [f"{x:,.{digits}f}".replace("-", "\N{MINUS SIGN}") for x in numbers]
     if not ends or ends[0] == ends[1]:
         return texts[0]
-    few = any(1 < len(sample(*run.split("/"), measure)) < bootstrap.FEW for run in runs)
-    few &= function in ("gain", "ratio", "value")
+    few = function in ("gain", "ratio", "value") and any(
+        1 < len(sample(*run.split("/"), measure)) < bootstrap.FEW for run in runs
+    )
     return f"{texts[0]} [{texts[1]}, {texts[2]}]{'*' * few}"
 
 

@@ -111,7 +111,7 @@ def _shape(crs: Any, source: Any, bounds: Bounds) -> tuple[str, float, float]:
     from pyproj import Proj, Transformer
 
     unit = crs.axis_info[0].unit_conversion_factor if crs.axis_info else 1.0
-    if not crs.is_projected:  # degrees, or a plane of its own
+    if not crs.is_projected:  # coordinates are degrees, or of no projection
         return ("degrees", math.inf, 1.0) if crs.is_geographic else ("a plane", 1.0, unit)
     at = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
     to_degrees = Transformer.from_crs(source, source.geodetic_crs, always_xy=True)

@@ -13,7 +13,7 @@ from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.files import damage, members
 from emberlink.envs.fire_files.plane import Bounds, Plane, Window, choose_plane
 from emberlink.envs.fire_files.report import Clock, Report, ask
-from emberlink.envs.fire_files.times import decided_unit, in_order, in_utc, parse_dates
+from emberlink.envs.fire_files.times import decided_unit, in_order, in_utc, names_unit, parse_dates
 from emberlink.envs.utils.errors import UserError
 
 _MAX_CELLS = 50_000_000
@@ -168,13 +168,13 @@ def _read(dataset: Any, most: int, band: int | None = None) -> np.ndarray:
 
 
 def _band(dataset: Any, last: bool, config: FileFireConfig, report: Report) -> _Times:
-    """Returns the times of a raster's only band, or of the `last`, with what the band is."""
+    """Returns the times of a raster's only or `last` band, their clock, and the band in words."""
     band = dataset.count if last else 1
     if dataset.count != band:
         raise ask(f"{dataset.count} bands", "one", "maps of states with fire.kind=masks")
     tags = {name.lower(): text for name, text in (dataset.tags() | dataset.tags(band)).items()}
     titles = dataset.descriptions[band - 1], tags.get("long_name"), tags.get("netcdf_varname")
-    told = (text for name, text in tags.items() if re.fullmatch("(time_?)?units?", name))
+    told = (text for name, text in tags.items() if names_unit(name))
     declared = (dataset.units[band - 1] or next(told, "")).strip()
     what = f"band {next((title for title in titles if title), band)!r:.60}"
     what += f", the last of {band} times" if band > 1 else ""

@@ -1,4 +1,4 @@
-"""Reads the features of vector files into one table of texts, and chooses those of one fire."""
+"""Reads vector files into one table of features and texts, and chooses the features of a fire."""
 
 import gc
 import io
@@ -149,7 +149,7 @@ def _placemarks(
     for part in (*element.iter("Data"), *element.iter("SimpleData")):
         row.setdefault(str(part.get("name")), "".join(part.itertext()).strip())
     for part in (element, *element.iter("MultiGeometry")):
-        for ring in part.findall("LinearRing"):  # which is no geometry of its own for shapely
+        for ring in part.findall("LinearRing"):  # GDAL reads a ring only within a polygon
             ring.tag = "LineString"
     yield row, [part for part in element if part.tag in _SHAPES]
 
@@ -176,8 +176,9 @@ def _where(table: Any, config: FileFireConfig) -> Any:
         if kept.empty:
             raise ask(f"fire.where={condition} keeps no feature", _counts(table, [name]))
         table, decided = kept, [*decided, name]
-    several = _several(table.drop(columns=decided), _KIND, _MAYBE_KIND)
-    if "*" in given or not several:
+    if "*" in given:
+        return table
+    if not (several := _several(table.drop(columns=decided), _KIND, _MAYBE_KIND)):
         return table
     choice = f"{several[0]}={table[several[0]].mode().iloc[0]}"
     every = f"{as_argument('fire.where', *given, '*')} for all of them"

@@ -79,6 +79,11 @@ def plain(name: Any) -> str:
     return re.sub(r"[\W_]", "", str(name).lower())
 
 
+def names_unit(name: Any) -> bool:
+    """Returns whether a column or a tag holds the unit of times, by its name."""
+    return re.fullmatch("(time)?units?", plain(name)) is not None
+
+
 def column_named(name: str, table: Any, key: str) -> Any:
     """Returns the column with a name in any case."""
     columns = {str(column).lower(): column for column in table}
@@ -134,10 +139,9 @@ def _elapsed(
     values: np.ndarray, name: str, table: Any, config: FileFireConfig, report: Report
 ) -> tuple[np.ndarray, Clock]:
     about = f"{name} ({values.min():g} to {values.max():g})"
-    told = [u for u in SECONDS if re.fullmatch(rf"elapsed{u[:2]}\w*|{u}", plain(name))]
-    for column in table if not told else ():
-        told = table[column].unique() if re.fullmatch("(time)?units?", plain(column)) else told
-    unit = decided_unit(told[0] if len(told) == 1 else "", config, about, report)
+    told = {u for u in SECONDS if re.fullmatch(rf"elapsed{u[:2]}\w*|{u}", plain(name))}
+    told = told or {text for column in table if names_unit(column) for text in table[column]}
+    unit = decided_unit(told.pop() if len(told) == 1 else "", config, about, report)
     report.facts.append(f"times from {name}")
     return in_order(values, unit, config)
 
@@ -164,7 +168,7 @@ def _columns(table: Any, given: str | Sequence[str] | None) -> list[Any]:
 
 
 def _clocks_beside(table: Any, date: Any) -> list[Any]:
-    """Returns the column of times of day named as that of the dates; asks about others."""
+    """Returns the column of times of day if its name says that it belongs to the dates, or asks."""
     names = _clocks(table.drop(columns=date))
     if names and (len(names) > 1 or plain(date).replace("date", "time") != plain(names[0])):
         key = f"{as_argument('fire.time_field', date, *names)} to join them"
@@ -178,10 +182,9 @@ def _clocks(table: Any) -> list[Any]:
     names = []
     for name in table:
         values = table[name][table[name] != ""]
-        form = r"(?i)\d\d?[:h]\d\d|[ap]\.?m\b"
-        if re.fullmatch(_OF_DAY, plain(name)) and values.str.match(r"\d{1,6}(?i:z|h|\b)").any():
-            form = ""
-        names += [name] if len(values) and values.str.match(form).all() else []
+        named = re.fullmatch(_OF_DAY, plain(name)) and values.str.match(r"\d{1,6}(?i:z|h|\b)").any()
+        all_are = len(values) > 0 and values.str.match(r"(?i)\d\d?[:h]\d\d|[ap]\.?m\b").all()
+        names += [name] if named or all_are else []
     return names
 
 

@@ -36,8 +36,8 @@ class Messages(nn.Module):
     key_size: ClassVar[int] = 0
     """numbers of a message besides its `size`, each a byte"""
     fault: str = "none"
-    """what happens to messages on their way: nothing; `zero`, all their numbers become 0; or
-    `shuffle`, a UAV's message is replaced by that of another UAV in another environment"""
+    """what happens to messages on their way: with `none` nothing, with `zero` their numbers become
+    0, with `shuffle` a UAV hears the message of another UAV in another environment instead"""
 
     def __init__(self, grouping: Grouping, inputs: int, size: int, **start: Any):
         super().__init__()

@@ -20,7 +20,7 @@ from emberlink.trainers.cli.parser import Parser
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command and returns its exit status, which is 2 for a mistake of the user.
 
-    Other errors than those of the user and the system end in a traceback.
+    Errors that are neither the user's nor the system's end in a traceback.
     """
     if sys.platform == "win32":
         return _report("emberlink", "runs on Linux and macOS; on Windows, use WSL")

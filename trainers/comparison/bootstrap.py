@@ -1,6 +1,6 @@
 """Computes statistics over training seeds and their bootstrap intervals.
 
-The statistics are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the
+The statistics follow Agarwal et al., "Deep Reinforcement Learning at the Edge of the
 Statistical Precipice" (2021), with SciPy: interquartile mean, percentile bootstrap, and probability
 of improvement.
 """

@@ -211,7 +211,7 @@ def _split(text: str) -> tuple[str, str]:
 
 
 def _module(place: str) -> Any:
-    """Imports a module of the working folder, or a file, which may import what is beside it."""
+    """Imports a module of the working folder, or a file, which may import the files beside it."""
     is_file = place.endswith(".py")
     if is_file and not Path(place).is_file():
         raise UserError(f"{place}: there is no such file")
@@ -226,7 +226,7 @@ def _module(place: str) -> Any:
         spec.loader.exec_module(module)
         return module
     except ModuleNotFoundError as error:
-        if f"{place}.".startswith(f"{error.name}."):  # not of what the module imports
+        if f"{place}.".startswith(f"{error.name}."):  # a module that it imports is its own mistake
             raise UserError(f"{place}: {error}") from None
         raise
     finally:

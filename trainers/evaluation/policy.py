@@ -82,7 +82,7 @@ class TrainedPolicy(TensorDictSequential):
 
     @property
     def card(self) -> dict[str, Any]:
-        """Facts for its user, as plain values: how it was made, and what it reads and writes."""
+        """Plain values that a user of the policy needs: its making, its inputs and its outputs."""
         config, decision = self.config, self.decision
         values = flat(to_values(config))
         spec: Any = empty_env(config).append_transform(primer_of(decision)).observation_spec
