@@ -88,7 +88,8 @@ class Consensus(CommModule):
     old_fire_only: Tensor
     """bool [num_envs, n]: whether a UAV was a discoverer without new fire at that step"""
     newest: Tensor
-    """int64 [num_envs, n, n]: step of the newest record that a UAV has had of another one, or -1"""
+    """float64 [num_envs, n, n]: step of the newest record that a UAV has had of another one, or
+    -1"""
     received: Tensor
     """float64 [num_envs, n, n, 5]: newer records of UAVs that a UAV received at the last step: step
     (-1 for none), position and rank"""
@@ -108,12 +109,12 @@ class Consensus(CommModule):
             self.register_buffer(name, torch.zeros(agents, dtype=torch.bool))
         self.register_buffer("altitude_sum", torch.zeros(agents, dtype=torch.float64))
         if world.radio.packets:
-            pairs, delay = (world.num_uavs, world.num_uavs), (world.radio.delay, num_envs)
-            self.links = Late(*delay, torch.tensor(False), *pairs)
-            self.records = Late(*delay, torch.tensor(-1.0, dtype=torch.float64), *pairs, 5)
-            self.register_buffer("newest", torch.full((num_envs, *pairs), -1))
-            nothing = torch.full((num_envs, *pairs, 5), -1.0, dtype=torch.float64)
-            self.register_buffer("received", nothing)
+            pairs, delay = (num_envs, world.num_uavs, world.num_uavs), world.radio.delay
+            nothing = torch.tensor(-1.0, dtype=torch.float64)
+            self.links = Late(delay, torch.tensor(False), *pairs)
+            self.records = Late(delay, nothing, *pairs, 5)
+            self.register_buffer("newest", nothing.repeat(pairs))
+            self.register_buffer("received", nothing.repeat(*pairs, 5))
 
     def specs(self, observation: Composite) -> Composite:
         shape, device = observation[keys.AGENTS].shape, observation.device
@@ -137,8 +138,9 @@ class Consensus(CommModule):
         for record in (self.fire_score, self.altitude_sum):
             record.masked_fill_(mask[:, None], 0)
         if self.world.radio.packets:
-            self.newest[mask] = -1
-            self.received[mask] = -1.0
+            self.links.start_episodes(mask)
+            for record in (self.newest, self.received):
+                record[mask] = -1.0
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._rewrite(tensordict.unsqueeze(0), tensordict)
@@ -214,32 +216,31 @@ class Consensus(CommModule):
             these records, see `received`; and the bytes of each UAV, int64 [steps, num_envs, n].
         """
         uavs, size = discovers.shape[-1], RECORD_BYTES + LATE_BYTES
-        own = torch.eye(uavs, dtype=torch.bool, device=discovers.device)
-        step, position, hears = (steps.get(k) for k in (keys.STEP, keys.POSITION, keys.HEARS))
-        budget, known, records, sent = steps.get(keys.BUDGET, None), [], [], []
-        for number, (finds, now) in enumerate(zip(discovers, step, strict=True)):
-            stamp = now.view(-1, 1, 1).expand(-1, uavs, 1).double()
-            mine = torch.cat((stamp, position[number], rank[number].unsqueeze(-1)), -1)
-            says = torch.where(finds.unsqueeze(-1), own, self.received[..., 0] >= 0)
-            says &= finds.unsqueeze(-1) | self.config.agree
-            record = torch.where(own.unsqueeze(-1), mine.unsqueeze(1), self.received)
-            if budget is not None:
+        own, finds = torch.eye(uavs, dtype=torch.bool, device=rank.device), discovers.unsqueeze(-1)
+        stamp = steps.get(keys.STEP)[..., None, None].expand(*discovers.shape, 1).double()
+        mine = torch.cat((stamp, steps.get(keys.POSITION), rank.unsqueeze(-1)), -1).unsqueeze(-3)
+        passes, finds = ~finds & self.config.agree, finds & own
+        links, budget = self.links(steps.get(keys.HEARS)), steps.get(keys.BUDGET, None)
+        most = None if budget is None else (budget // size).unsqueeze(-1)
+        received, known, records, sent = self.received, [], [], []
+        for number, arrives in enumerate(links.unsqueeze(-1)):
+            says = finds[number] | passes[number] & (received[..., 0] >= 0)
+            record = torch.where(own.unsqueeze(-1), mine[number], received)
+            if most is not None:
                 order = record[..., 4].masked_fill(~says, -torch.inf).argsort(-1, descending=True)
-                says &= order.argsort(-1) < (budget[number] // size).unsqueeze(-1)
-            heard = self.records(now, torch.where(says.unsqueeze(-1), record, -1.0))
-            links = self.links(now, hears[number])
+                says &= order.argsort(-1) < most[number]
+            heard = self.records(torch.where(says.unsqueeze(-1), record, -1.0))
             # [num_envs, hearers, speakers, discoverers]
-            told = torch.where(links.unsqueeze(-1), heard[..., 0].unsqueeze(1), -1.0)
-            told, speaker = told.masked_fill(own.unsqueeze(-2), -1.0).max(2)
-            told = told.long()
-            new = told > self.newest
+            told, speaker = torch.where(arrives, heard[..., 0].unsqueeze(1), -1.0).max(2)
+            new = (told > self.newest) & ~own
             self.newest.copy_(torch.maximum(self.newest, told))
             found = heard.gather(1, speaker.unsqueeze(-1).expand(*speaker.shape, 5))
-            self.received.copy_(torch.where(new.unsqueeze(-1), found, -1.0))
+            received = torch.where(new.unsqueeze(-1), found, -1.0)
             known.append(new)
-            records.append(self.received.clone())
-            sent.append(size * says.sum(-1))
-        return torch.stack(known), torch.stack(records), torch.stack(sent)
+            records.append(received)
+            sent.append(says)
+        self.received.copy_(received)
+        return torch.stack(known), torch.stack(records), size * torch.stack(sent).sum(-1)
 
     def _update_track_record(self, steps: TensorDictBase, discovers: Tensor) -> Tensor:
         """Adds the steps to the track records; returns ranks, float64 [steps, num_envs, n]."""

@@ -61,8 +61,8 @@ class Maps(CommModule):
         sizes = torch.full((area + world.num_uavs,), cell_bytes(world.horizon))
         sizes[area:] = 2 + step_bytes(world.horizon) + 12  # UAV, step, three float32 numbers
         self.messages = Exchange(world.radio, sizes, agents, unit=4)
-        pairs = world.num_uavs, world.num_uavs
-        self.places = radio.Late(world.radio.delay, num_envs, torch.tensor(0.0), *pairs, 3)
+        pairs = num_envs, world.num_uavs, world.num_uavs
+        self.places = radio.Late(world.radio.delay, torch.tensor(0.0), *pairs, 3)
         self.register_buffer("home", torch.zeros(*agents, 3, dtype=torch.float32))
         base = torch.tensor(world.base or (0.0, 0.0), dtype=torch.float32)
         self.register_buffer("_base", base, persistent=False)
@@ -78,7 +78,7 @@ class Maps(CommModule):
         self.messages.saw(maps.view)
         hears = tensordict.get(keys.HEARS)
         self._said, _, new = self.messages(maps.known, hears, step, left)
-        places, area = self.places(step, maps.place.clone()), maps.sensor.area
+        places, area = self.places(maps.place.clone()), maps.sensor.area
         env, hearer, speaker, entry = new[:, new[3] >= area]
         uav = entry - area
         maps.place[env, hearer, uav] = places[env, speaker, uav]

@@ -44,9 +44,9 @@ class Positional(CommModule):
     def __init__(self, world: WildfireConfig, config: PositionalConfig, num_envs: int = 1):
         super().__init__(world, config, num_envs)
         self.numbers = len(keys.FEATURES if self.maps is None else "xyz")
-        sent = world.radio.delay, num_envs
-        self.links = Late(*sent, torch.tensor(False), *[world.num_uavs] * 2)
-        self.said = Late(*sent, torch.tensor(0.0), world.num_uavs, self.numbers)
+        delay, agents = world.radio.delay, (num_envs, world.num_uavs)
+        self.links = Late(delay, torch.tensor(False), *agents, world.num_uavs)
+        self.said = Late(delay, torch.tensor(0.0), *agents, self.numbers)
         # UAVs that fail send nothing from then on, and late messages may be of any step.
         self.every_step = world.measures == "all" or world.radio.delay > 0
         own = torch.eye(world.num_uavs, dtype=torch.bool)
@@ -65,16 +65,38 @@ class Positional(CommModule):
         )
         return observation
 
+    def reset(self, tensordict: TensorDictBase, mask: Tensor) -> None:
+        """Forgets the messages in flight."""
+        self.links.start_episodes(mask)
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        step, left = tensordict.get(keys.STEP), tensordict.get(keys.BUDGET, None)
-        vectors = tensordict.get(keys.OBSERVATION if self.maps is None else keys.POSITION)
-        hears = tensordict.get(keys.HEARS)
+        hears, heard = self._converse(tensordict)
+        if self.maps is None:
+            return self._join(tensordict, hears, heard)
+        sent = tensordict.get(keys.STEP) - self.world.radio.delay
+        self.maps.hear_positions(hears, sent, heard)
+        return tensordict
+
+    def take_part(
+        self, steps: TensorDictBase, last: TensorDictBase
+    ) -> tuple[TensorDictBase, Tensor | None, Tensor | None]:
+        if self.maps is not None:
+            return super().take_part(steps, last)
+        hears, heard = self._converse(steps)
+        sent = self.bytes_sent(steps) if self.counts else None
+        return self._join(last, hears[-1], heard[-1]), None, sent
+
+    def _converse(self, steps: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Returns whose vectors arrive at each UAV, bool [..., n, n], and these vectors."""
+        hears, left = steps.get(keys.HEARS), steps.get(keys.BUDGET, None)
         if left is not None:
             hears = hears & (left >= 4 * self.numbers).unsqueeze(-2)
-        hears, heard = self.links(step, hears), self.said(step, vectors)
-        if self.maps is not None:
-            self.maps.hear_positions(hears, step - self.world.radio.delay, heard)
-            return tensordict
+        vectors = steps.get(keys.OBSERVATION if self.maps is None else keys.POSITION)
+        return self.links(hears), self.said(vectors)
+
+    def _join(self, tensordict: TensorDictBase, hears: Tensor, heard: Tensor) -> TensorDictBase:
+        """Rewrites the observations of a time step, of the vectors that arrive at it."""
+        vectors = tensordict.get(keys.OBSERVATION)
         joined = torch.where(hears.unsqueeze(-1), heard.unsqueeze(-3), 0.0)
         joined = torch.where(self._own.unsqueeze(-1), vectors.unsqueeze(-3), joined)
         if self.config.own_first:

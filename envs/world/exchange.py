@@ -108,14 +108,14 @@ class Exchange(nn.Module):
         self.register_buffer("codes", nothing.repeat(envs, config.delay + 1, radios, items))
         self.register_buffer("said_at", torch.full_like(self.codes, -1))
         no = torch.tensor(False)
-        self.links = Late(config.delay, envs, no, 2, radios, radios)
+        self.links = Late(config.delay, no, envs, 2, radios, radios)
 
     def start_episodes(self, mask: Tensor) -> None:
         """Forgets everything in the environments of a mask, bool [envs]."""
         blank = dict.fromkeys(("pending", "rank", "contact", "got", "acknowledged"), 0)
         blank |= dict.fromkeys(("heard", "reached", "told_at", "said_at"), -1)
         blank |= dict.fromkeys(("told", "has"), _NOTHING)
-        self.links.sent[mask] = False
+        self.links.start_episodes(mask)
         for name, value in blank.items():
             getattr(self, name)[mask] = value
 
@@ -152,7 +152,7 @@ class Exchange(nn.Module):
         """
         entry, code, sent = self._speak(known, step, left)
         now = torch.stack((hears & (sent > 0).unsqueeze(1), self.got), 1)
-        arrives, acks = self.links(step, now).unbind(1)
+        arrives, acks = self.links(now).unbind(1)
         if self.config.delay:
             entry, code = self._fly(entry, code, step, arrives.any(1))
         self.acknowledged.copy_(arrives & acks.mT)

@@ -104,44 +104,46 @@ class Channel(nn.Module):
         loss = self.config.loss
         ends = min(1 / self.config.burst, 1 - loss)
         begins, lasts = loss * ends / (1 - loss) if loss < 1 else 1.0, 1 - ends
-        units, steps = (unit, step) if step.ndim > 1 else (unit.unsqueeze(0), step.unsqueeze(0))
-        spells = []
-        for u, first in zip(units, (steps == 0)[..., None, None], strict=True):
-            bad = (u < begins) | self.bad & (u < lasts)
-            self.bad.copy_(torch.where(first, u < loss, bad))
-            spells.append(self.bad.clone())
-        return torch.stack(spells) if step.ndim > 1 else spells[0]
+        units = unit if step.ndim > 1 else unit.unsqueeze(0)
+        first = (step == 0)[..., None, None]
+        gets, stays = units < torch.where(first, loss, begins), ~first & (units < lasts)
+        # The last change of a link decides: even numbers for good, odd ones for bad.
+        number = 2 * torch.arange(1, len(units) + 1, device=unit.device)[:, None, None, None]
+        change = torch.where(gets, number + 1, torch.where(stays, self.bad, number))
+        bad = change.cummax(0).values % 2 == 1
+        self.bad.copy_(bad[-1])
+        return bad.view_as(unit)
 
 
 class Late(nn.Module):
-    """Keeps the messages of the last `delay` steps and of the present one until they arrive.
+    """Keeps the messages of the last `delay` steps until they arrive.
 
     Args:
         delay: steps from sending to receiving.
-        envs: number of environments.
-        blank: the message that arrives before step `delay`; has the data type of messages.
-        shape: of an environment's messages of a step.
+        blank: the message [] that arrives before step `delay`.
+        shape: of the messages of a step: environments first.
     """
 
     sent: Tensor
-    """[envs, delay + 1, *shape]"""
+    """[envs, delay, ...], the oldest first"""
 
-    def __init__(self, delay: int, envs: int, blank: Tensor, *shape: int):
+    def __init__(self, delay: int, blank: Tensor, *shape: int):
         super().__init__()
         self.delay, self.blank = delay, blank.item()
-        size = (envs, delay + 1 if delay else 0, *shape)
-        self.register_buffer("sent", torch.full(size, self.blank, dtype=blank.dtype))
+        self.register_buffer("sent", blank.repeat(shape[0], delay, *shape[1:]))
 
-    def forward(self, step: Tensor, now: Tensor) -> Tensor:
-        """Sends a tensor [envs, ...] at the steps [envs]; returns what arrives."""
+    def start_episodes(self, mask: Tensor) -> None:
+        """Forgets the messages in the environments of a mask, bool [envs]."""
+        self.sent[mask] = self.blank
+
+    def forward(self, now: Tensor) -> Tensor:
+        """Returns what arrives when `now`, [(steps,) envs, ...], is sent at one or more steps."""
         if not self.delay:
             return now
-        env = torch.arange(len(step), device=step.device)
-        self.sent[env, step % (self.delay + 1)] = now
-        then = self.sent[env, (step - self.delay) % (self.delay + 1)]
-        early = step < self.delay
-        then[early] = self.blank
-        return then
+        steps = now if now.ndim == self.sent.ndim else now.unsqueeze(0)
+        series = torch.cat((self.sent.transpose(0, 1), steps))
+        self.sent.copy_(series[-self.delay :].transpose(0, 1))
+        return series[: len(steps)].view_as(now)
 
 
 def fade(far: Tensor) -> Tensor:

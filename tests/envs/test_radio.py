@@ -92,18 +92,19 @@ def test_bad_spells_have_their_share_and_their_length(loss, burst, length):
     assert (lost[:-1].sum() / ended).item() == pytest.approx(length, rel=0.06)
 
 
-@given(delay=st.integers(0, 6), begins=st.lists(st.integers(1, 9), min_size=1, max_size=4))
-def test_what_is_late_arrives_as_it_was_sent_and_in_its_episode(delay, begins):
-    late, sent = Late(delay, 1, torch.tensor(-1), 2), 0
-    for length in begins:
-        episode = []
-        for step in range(length):
-            sent += 1
-            episode.append(sent)
-            for _ in range(2):  # asking again changes nothing
-                arrives = late(torch.tensor([step]), torch.tensor([[sent, 2 * sent]]))
-            then = episode[step - delay] if step >= delay else None
-            assert arrives.tolist() == [[-1, -1] if then is None else [then, 2 * then]]
+@given(
+    delay=st.integers(0, 6),
+    lengths=st.lists(st.integers(1, 9), min_size=1, max_size=4),
+    together=st.booleans(),
+)
+def test_what_is_late_arrives_as_it_was_sent_and_in_its_episode(delay, lengths, together):
+    late, sent = Late(delay, torch.tensor(-1), 1, 2), 1
+    for length in lengths:
+        late.start_episodes(torch.tensor([True]))
+        said = torch.arange(sent, sent + length).view(-1, 1, 1) * torch.tensor([1, 2])
+        sent += length
+        arrives = late(said) if together else torch.stack([late(step) for step in said])
+        assert arrives.equal(torch.cat((torch.full((delay, 1, 2), -1), said))[:length])
 
 
 @pytest.mark.parametrize(("horizon", "cell"), [(1000, 5), (65_535, 5), (65_536, 7)])
