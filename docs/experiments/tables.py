@@ -107,8 +107,10 @@ def sample(study: str, run: str, measure: str) -> Any:
 
 def iqm(samples: Any, _: str, run: int = 0, last: int = 0, seeds: int | None = None) -> Any:
     """Returns the interquartile mean over seeds of a run, at its last points, and its interval."""
-    means = samples[run][:seeds, -last:].mean(1)
-    return bootstrap.iqm(means), bootstrap.interval(bootstrap.iqm, means)
+    values = samples[run][:seeds, -last:]
+    if last:  # points of a learning curve, not fires
+        values = values.mean(1, keepdims=True)
+    return bootstrap.iqm(values.mean(1)), bootstrap.crossed_interval(bootstrap.iqm, values)
 
 
 def gain(samples: Any, measure: str, key: str = "gain", retrained: bool = True) -> Any:
@@ -127,8 +129,8 @@ def rise(samples: Any, _: str) -> Any:
 
 def ratio(samples: Any, measure: str) -> Any:
     """Returns how many times better a method is than the best other one, with its interval."""
-    means = [values.mean(1) for values in samples if len(values)]
-    return bootstrap.ratio_to_best(*means, higher=measure in metrics.HIGHER_IS_BETTER)
+    samples = [values for values in samples if len(values)]
+    return bootstrap.ratio_to_best(*samples, higher=measure in metrics.HIGHER_IS_BETTER)
 
 
 FUNCTIONS: dict[str, Any] = {

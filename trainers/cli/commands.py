@@ -107,7 +107,7 @@ def _export(options: argparse.Namespace, console: "Console") -> int:
 def add_compare(commands: Any) -> None:
     text = """compare runs: methods, setups, several seeds
     Gathers finished runs by setup, world, training fire and method and prints interquartile
-    means with 95 % bootstrap intervals over seeds, the gain of messages, and the paper's
+    means with 95 % intervals over seeds and fires, the gain of messages, and the paper's
     claims; writes compare.html, with all tables and figures, and compare.json to a folder.
     emberlink compare runs/ --output comparison
     """

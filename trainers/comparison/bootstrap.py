@@ -7,7 +7,7 @@ of improvement.
 
 import warnings
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -23,9 +23,7 @@ BAND_RESAMPLES = 2_000
 BOOTSTRAP_SEED = 20_210_830
 """seed of the resamples of every interval"""
 FEW = 5
-"""number of seeds below which intervals are flagged. With 2, 3 or 4 seeds, an interval extends from
-the worst to the best seed, which contains the population median with a probability of 50 %, 75 % or
-88 %."""
+"""number of seeds below which intervals are flagged: they are too narrow"""
 
 Values = NDArray[np.float64]
 Interval = tuple[float, float]
@@ -71,34 +69,30 @@ def as_ratio(share: float) -> float:
 
 
 def ratio_to_best(*samples: Values, higher: bool) -> tuple[float, Interval | None]:
-    """Returns the ratio of the first IQM to the best other, above 1 if better, and its interval."""
-    share = partial(iqm_ratio_share, higher=higher)
-    ends = interval(share, *samples)
-    return as_ratio(float(share(*samples))), ends and (as_ratio(ends[0]), as_ratio(ends[1]))
+    """Returns the ratio of the first IQM to the best other, above 1 if better, and its interval.
 
-
-def interval(
-    statistic: Callable[..., Any],
-    *samples: Sequence[float] | Values,
-    axis: int = -1,
-    resamples: int = RESAMPLES,
-) -> Any:
-    """Returns both ends of the 95 % percentile bootstrap interval of a statistic.
-
-    `samples` hold one number per run along `axis`, for each method. None if there is only one run,
-    or an end is not finite.
+    `samples` are [seeds, fires] for each method.
     """
-    values = [np.asarray(sample, float) for sample in samples]
-    if min(sample.shape[axis] for sample in values) < 2:
+    share = partial(iqm_ratio_share, higher=higher)
+    ends = crossed_interval(share, *samples)
+    now = float(share(*(sample.mean(1) for sample in samples)))
+    return as_ratio(now), ends and (as_ratio(ends[0]), as_ratio(ends[1]))
+
+
+def curve_interval(curves: Values) -> Any:
+    """Returns both ends of the 95 % percentile bootstrap interval of the IQM of curves, [points].
+
+    `curves` are [seeds, points]. None if there is only one, or an end is not finite.
+    """
+    if len(curves) < 2:
         return None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", stats.DegenerateDataWarning)
         ends = stats.bootstrap(
-            values,
-            statistic,
-            axis=axis,
-            n_resamples=resamples,
-            batch=1000,
+            [curves],
+            iqm,
+            axis=0,
+            n_resamples=BAND_RESAMPLES,
             confidence_level=LEVEL,
             method="percentile",
             vectorized=True,
@@ -146,9 +140,9 @@ def _crossed(
     statistic: Callable[..., Any], samples: Sequence[Values], seeds: bool = True
 ) -> Values:
     """Returns a statistic of resamples of fires and, if wanted, seeds, see `crossed_interval`."""
+    share, state = _drawn_fires(samples[0].shape[1], RESAMPLES)
     generator = np.random.default_rng(BOOTSTRAP_SEED)
-    fires = samples[0].shape[1]
-    share = generator.multinomial(fires, [1 / fires] * fires, RESAMPLES).T / fires
+    generator.bit_generator.state = state
     drawn: list[Values] = []
     for sample in samples:
         drawn.append(sample @ share)
@@ -156,6 +150,14 @@ def _crossed(
             rows = generator.integers(len(sample), size=(len(sample), RESAMPLES))
             drawn[-1] = np.take_along_axis(drawn[-1], rows, axis=0)
     return statistic(*drawn, axis=0)
+
+
+@lru_cache(4)
+def _drawn_fires(fires: int, resamples: int) -> tuple[Values, Any]:
+    """Returns the share of each fire in resamples, and the generator's state afterwards."""
+    generator = np.random.default_rng(BOOTSTRAP_SEED)
+    share = generator.multinomial(fires, [1 / fires] * fires, resamples).T / fires
+    return share, generator.bit_generator.state
 
 
 def _finite(ends: Any) -> Any:

@@ -1,8 +1,9 @@
-"""Tests the claims of the paper (sections V and VI) with intervals over seeds."""
+"""Tests the claims of the paper (sections V and VI) with intervals over seeds and fires."""
 
 from itertools import product
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from emberlink.envs import metrics
@@ -59,11 +60,12 @@ def verdicts(runs: Frame, means: Frame) -> tuple[Frame, list[str]]:
 
 def _verdict(means: Frame, label: str, measure: str, factor: float) -> dict[str, Any]:
     """Returns the verdict about a label, given the means of it and of the others."""
-    values = {name: part.to_numpy(float) for name, part in means.groupby("label")["value"]}
+    groups = means.groupby("label")["values"]
+    values = {name: np.array(part.tolist(), float) for name, part in groups}
     samples = [values.pop(label), *values.values()]
     higher = measure in metrics.HIGHER_IS_BETTER
     ratio, ends = bootstrap.ratio_to_best(*samples, higher=higher)
-    iqms = [float(bootstrap.iqm(sample)) for sample in samples[1:]]
+    iqms = [float(bootstrap.iqm(sample.mean(1))) for sample in samples[1:]]
     low, high = ends or (None, None)
     return {
         "best_other": [*values][iqms.index(max(iqms) if higher else min(iqms))],

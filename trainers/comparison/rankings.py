@@ -8,7 +8,7 @@ import pandas as pd
 
 from emberlink.envs import metrics
 from emberlink.trainers.comparison import bootstrap
-from emberlink.trainers.comparison.bootstrap import BAND_RESAMPLES, Values
+from emberlink.trainers.comparison.bootstrap import Values
 from emberlink.trainers.comparison.tables import Frame, learned, settings_table, trained_settings
 from emberlink.trainers.evaluation.scores import CURVES, LEARNED
 
@@ -58,21 +58,22 @@ def rank(runs: Frame, means: Frame) -> Frame:
 def _rows(means: Frame, higher: bool, unranked: bool) -> list[dict[str, Any]]:
     """Returns the rows of the trained policies of one measure, best first."""
     groups: dict[Any, Frame] = dict(iter(means.groupby("label")))
-    values = {label: part["value"].to_numpy(float) for label, part in groups.items()}
-    iqms = {label: float(bootstrap.iqm(sample)) for label, sample in values.items()}
+    values = {label: np.array(part["values"].tolist(), float) for label, part in groups.items()}
+    iqms = {label: float(bootstrap.iqm(sample.mean(1))) for label, sample in values.items()}
     order = list(groups)
     if not unranked:
         order.sort(key=lambda label: -iqms[label] if higher else iqms[label])
     rows: list[dict[str, Any]] = []
     for label, other in zip_longest(order, [] if unranked else order[1:]):
-        low, high = bootstrap.interval(bootstrap.iqm, values[label]) or (None, None)
+        low, high = bootstrap.crossed_interval(bootstrap.iqm, values[label]) or (None, None)
         row: dict[str, Any] = {"label": label, "policy": LEARNED, "next": other or ""}
-        row |= {"seeds": groups[label]["seed"].tolist(), "values": values[label].tolist()}
+        row |= {"seeds": groups[label]["seed"].tolist(), "values": values[label].mean(1).tolist()}
         row |= {"iqm": iqms[label], "low": low, "high": high}
         if other and groups[label]["run"].isin(groups[other]["run"]).sum() == 0:
             pair = (values[label], values[other])[:: 1 if higher else -1]
-            if ends := bootstrap.interval(bootstrap.probability_of_improvement, *pair):
-                row["probability"] = float(bootstrap.probability_of_improvement(*pair))
+            if ends := bootstrap.crossed_interval(bootstrap.probability_of_improvement, *pair):
+                now = bootstrap.probability_of_improvement(*(sample.mean(1) for sample in pair))
+                row["probability"] = float(now)
                 row["probability_low"], row["probability_high"] = ends
         rows.append(row)
     return rows
@@ -124,7 +125,6 @@ def curves(runs: Frame) -> Frame:
 
 def band(values: Values, episodes: Any, **about: Any) -> Frame:
     """Returns the interquartile mean of curves, [seeds, episodes], and the ends of its interval."""
-    ends = bootstrap.interval(bootstrap.iqm, values, axis=0, resamples=BAND_RESAMPLES)
-    low, high = ends or (np.nan, np.nan)
+    low, high = bootstrap.curve_interval(values) or (np.nan, np.nan)
     middle = bootstrap.iqm(values, axis=0)
     return pd.DataFrame({**about, "episode": episodes, "iqm": middle, "low": low, "high": high})

@@ -37,7 +37,7 @@ NUMBERS = {
 }
 """columns that are aligned to the right"""
 RANKED = (
-    "IQM: interquartile mean over seeds; interval: bootstrap over seeds; ↑ more is better, "
+    "IQM: interquartile mean over seeds; interval: over seeds and fires; ↑ more is better, "
     "↓ less is better. A scripted policy has no seeds: its number is the mean over the fires."
 )
 GAINED = (

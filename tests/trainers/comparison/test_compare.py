@@ -16,7 +16,7 @@ from emberlink.envs import metrics
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
 from emberlink.trainers.comparison import claims
-from emberlink.trainers.comparison.bootstrap import crossed_interval, crossed_p, iqm_difference
+from emberlink.trainers.comparison.bootstrap import crossed_interval, crossed_p, iqm, iqm_difference
 from emberlink.trainers.comparison.comparison import compare_runs
 
 LOSS, LOST = {"loss": 0.5}, "consensus, evaluated with env.radio.loss=0.5"
@@ -246,6 +246,8 @@ def test_difference_by_hand(comparison):
     assert value == 60 - 52.5
     assert ends == crossed_interval(iqm_difference, first, second)
     assert p == crossed_p(iqm_difference, first, second)
+    row = comparison.ranking.query("label == 'consensus' and measure == 'coverage'").iloc[0]
+    assert (row["low"], row["high"]) == crossed_interval(iqm, first)
     assert comparison.difference(LOST, "positional", "coverage") == (31 - 20, None, None)
     for wrong in (("consensu", "coverage"), ("positional", "mean_reward"), (LOST, "coverage")):
         with pytest.raises(UserError, match=r"is not known|rewards differ|same runs"):

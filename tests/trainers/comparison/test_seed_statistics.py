@@ -13,11 +13,11 @@ from emberlink.trainers.comparison.bootstrap import (
     crossed_interval,
     crossed_p,
     holm,
-    interval,
     iqm,
     iqm_difference,
     iqm_ratio_share,
     probability_of_improvement,
+    ratio_to_best,
 )
 
 numbers = st.lists(st.integers(0, 40).map(float), min_size=1, max_size=9)
@@ -65,16 +65,14 @@ def test_statistics_equal_plain_python(sample, reference):
     ],
 )
 def test_ratio_to_the_best_other(sample, others, higher, ratio):
-    share = iqm_ratio_share(
-        np.asarray(sample, float), *(np.asarray(o, float) for o in others), higher=higher
-    )
+    share = iqm_ratio_share(*(np.asarray(x, float) for x in (sample, *others)), higher=higher)
     assert as_ratio(float(share)) == pytest.approx(ratio)
 
 
 @pytest.mark.parametrize("values", [[1, 2, 4, 8], [0.1, 0.7, 0.2, 0.9, 0.4]])
 def test_interval_equals_that_of_all_resamples(values):
     low, high = plain_interval(lambda chosen: plain_iqm(chosen), values)
-    got = interval(iqm, values)
+    got = crossed_interval(iqm, np.array(values)[:, None])
     # 10,000 resamples are drawn, so that an end may be the neighbouring value.
     assert got is not None
     assert got == pytest.approx((low, high), abs=0.06 * (max(values) - min(values)))
@@ -83,13 +81,12 @@ def test_interval_equals_that_of_all_resamples(values):
 
 
 def test_interval_of_a_difference_is_over_the_seeds_of_both():
-    first, second = [1.0, 3.0, 8.0], [2.0, 6.0]
-    got = interval(iqm_difference, first, second)
+    first, second = np.array([[1.0], [3], [8]]), np.array([[2.0], [6]])
+    got = crossed_interval(iqm_difference, first, second)
     # There are 27 means of the first and 4 of the second. Of the 108 differences, the least are -5,
     # once, and 5/3 - 6, three times. These 4 are 3.7 % of all, so the 2.5 % quantile is 5/3 - 6.
     assert got == pytest.approx((5 / 3 - 6, 19 / 3 - 2), abs=1e-9)
-    assert interval(iqm_difference, first, second) == got
-    assert interval(iqm_difference, first, [2.0]) is None
+    assert crossed_interval(iqm_difference, first, second[:1]) is None
 
 
 def mean_difference(first, second, axis=-1):
@@ -106,11 +103,11 @@ def test_the_crossed_interval_draws_seeds_and_the_same_fires():
     fires, seeds = np.array([[0.0, 10, 20]]), np.array([[1.0], [2], [4]])
     # The trainings differ by 3 on each fire, whichever fires are drawn: only seeds count.
     low, high = crossed_interval(mean_difference, seeds + fires + 3, seeds + fires) or (0, 0)
-    alone = interval(mean_difference, (seeds[:, 0] + 3).tolist(), seeds[:, 0].tolist())
-    assert (low, high) == pytest.approx(alone, abs=0.4)
+    assert (low, high) == pytest.approx(crossed_interval(mean_difference, seeds + 3, seeds))
     # One of them gains on a fire: without spread over seeds, only fires count.
     first, second = np.repeat(fires, 2, axis=0), np.zeros((2, 3))
     assert crossed_interval(mean_difference, first, second) == (0, 20)
+    assert ratio_to_best(first + 5, second + 10, higher=True)[1] == pytest.approx((0.5, 2.5))
     assert crossed_interval(mean_difference, first[:1], second) is None
 
 
