@@ -3,13 +3,18 @@
 from itertools import product
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from emberlink.envs import metrics
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.bootstrap import Interval
-from emberlink.trainers.comparison.tables import Frame, learned, telling_apart, trained_settings
+from emberlink.trainers.comparison.tables import (
+    Frame,
+    by_fire,
+    learned,
+    telling_apart,
+    trained_settings,
+)
 
 ROUNDING = 1e-6
 """relative error of a ratio of measures, which are float32"""
@@ -60,8 +65,7 @@ def verdicts(runs: Frame, means: Frame) -> tuple[Frame, list[str]]:
 
 def _verdict(means: Frame, label: str, measure: str, factor: float) -> dict[str, Any]:
     """Returns the verdict about a label, given the means of it and of the others."""
-    groups = means.groupby("label")["values"]
-    values = {name: np.array(part.tolist(), float) for name, part in groups}
+    values = {name: by_fire(part) for name, part in means.groupby("label")}
     samples = [values.pop(label), *values.values()]
     higher = measure in metrics.HIGHER_IS_BETTER
     ratio, ends = bootstrap.ratio_to_best(*samples, higher=higher)

@@ -87,7 +87,7 @@ class Comparison:
         if parts[0]["run"].isin(parts[1]["run"]).any():
             raise UserError(f"{first!r} and {second!r} are evaluations of the same runs")
         iqms = [float(bootstrap.iqm(part["value"].to_numpy(float))) for part in parts]
-        samples = [np.array(part["values"].tolist(), float) for part in parts]
+        samples = [tables.by_fire(part) for part in parts]
         ends = bootstrap.crossed_interval(bootstrap.iqm_difference, *samples)
         p = bootstrap.crossed_p(bootstrap.iqm_difference, *samples)
         return Difference(iqms[0] - iqms[1], ends, p)

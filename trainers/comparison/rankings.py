@@ -9,7 +9,13 @@ import pandas as pd
 from emberlink.envs import metrics
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.bootstrap import Values
-from emberlink.trainers.comparison.tables import Frame, learned, settings_table, trained_settings
+from emberlink.trainers.comparison.tables import (
+    Frame,
+    by_fire,
+    learned,
+    settings_table,
+    trained_settings,
+)
 from emberlink.trainers.evaluation.scores import CURVES, LEARNED
 
 REWARD = "mean_reward"
@@ -58,7 +64,7 @@ def rank(runs: Frame, means: Frame) -> Frame:
 def _rows(means: Frame, higher: bool, unranked: bool) -> list[dict[str, Any]]:
     """Returns the rows of the trained policies of one measure, best first."""
     groups: dict[Any, Frame] = dict(iter(means.groupby("label")))
-    values = {label: np.array(part["values"].tolist(), float) for label, part in groups.items()}
+    values = {label: by_fire(part) for label, part in groups.items()}
     iqms = {label: float(bootstrap.iqm(sample.mean(1))) for label, sample in values.items()}
     order = list(groups)
     if not unranked:

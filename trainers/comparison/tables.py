@@ -10,8 +10,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
+from emberlink.trainers.comparison.bootstrap import Values
 from emberlink.trainers.comparison.reading import EvaluatedRun, LeftOut
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH
 from emberlink.trainers.evaluation.scores import LEARNED
@@ -163,3 +165,8 @@ def means_table(runs: Frame) -> Frame:
 def learned(means: Frame) -> Frame:
     """Returns the rows of trained policies."""
     return means[means["policy"] == LEARNED]
+
+
+def by_fire(means: Frame) -> Values:
+    """Returns the values of rows of `means_table`, float64 [rows, fires]."""
+    return np.array(means["values"].tolist(), float)
