@@ -18,6 +18,8 @@ _LACKING, _OPEN = 1, 2
 """states of entries, see `Exchange.pending`"""
 _NOTHING = -2
 """the code of an entry that nobody has seen"""
+_NEVER = -CONTACT
+"""the step of a message that never came"""
 
 
 class Exchange(nn.Module):
@@ -62,12 +64,12 @@ class Exchange(nn.Module):
     told_at: Tensor
     """int32 [envs, r, items]: the steps at which they were said, -1 for never"""
     heard: Tensor
-    """int64 [envs, r, r]: step of the last message that a radio (row) received, -1 for none"""
+    """int32 [envs, r, r]: step of the last message that a radio (row) received"""
     got: Tensor
     """bool [envs, r, r]: the messages that a radio (row) received at the last step"""
     reached: Tensor
-    """int64 [envs, r, r, r]: step at which a radio (second) last heard another one (third)
-    acknowledge a message of one (last), -1 for never"""
+    """int32 [envs, r, r, r]: step at which a radio (second) last heard another one (third)
+    acknowledge a message of one (last)"""
     codes: Tensor
     """int32 [envs, delay + 1, r, items]: the codes of the entries said at a step"""
     said_at: Tensor
@@ -99,8 +101,9 @@ class Exchange(nn.Module):
         pairs = envs, radios, radios
         for name in ("contact", "got", "acknowledged"):
             self.register_buffer(name, torch.zeros(pairs, dtype=torch.bool))
-        self.register_buffer("heard", torch.full(pairs, -1))
-        self.register_buffer("reached", torch.full((*pairs, radios), -1))
+        never = torch.tensor(_NEVER, dtype=torch.int32)
+        self.register_buffer("heard", never.repeat(pairs))
+        self.register_buffer("reached", never.repeat(*pairs, radios))
         self.register_buffer("told_at", torch.full(self.shape, -1, dtype=torch.int32))
         nothing = torch.tensor(_NOTHING, dtype=torch.int32)
         self.register_buffer("told", nothing.repeat(self.shape))
@@ -113,8 +116,8 @@ class Exchange(nn.Module):
     def start_episodes(self, mask: Tensor) -> None:
         """Forgets everything in the environments of a mask, bool [envs]."""
         blank = dict.fromkeys(("pending", "rank", "contact", "got", "acknowledged"), 0)
-        blank |= dict.fromkeys(("heard", "reached", "told_at", "said_at"), -1)
-        blank |= dict.fromkeys(("told", "has"), _NOTHING)
+        blank |= dict.fromkeys(("told_at", "said_at"), -1) | dict.fromkeys(("told", "has"), _NOTHING)
+        blank |= dict.fromkeys(("heard", "reached"), _NEVER)
         self.links.start_episodes(mask)
         for name, value in blank.items():
             getattr(self, name)[mask] = value
@@ -156,13 +159,13 @@ class Exchange(nn.Module):
         if self.config.delay:
             entry, code = self._fly(entry, code, step, arrives.any(1))
         self.acknowledged.copy_(arrives & acks.mT)
-        told = arrives.unsqueeze(-1) & acks.unsqueeze(1)
-        self.reached.copy_(torch.where(told, step.view(-1, 1, 1, 1), self.reached))
+        told, at = arrives.unsqueeze(-1) & acks.unsqueeze(1), step.int().view(-1, 1, 1, 1)
+        torch.where(told, at, self.reached, out=self.reached)
         self.got.copy_(arrives)
-        self.heard.copy_(torch.where(arrives, step.view(-1, 1, 1), self.heard))
-        reaches = _lately(self.reached, step.view(-1, 1, 1, 1))
-        reaches |= torch.eye(self.shape[1], dtype=torch.bool, device=entry.device)
-        passes = (self.contact.unsqueeze(2) & ~reaches).any(-1)
+        torch.where(arrives, at.squeeze(-1), self.heard, out=self.heard)
+        reaches = _lately(self.reached, at)
+        reaches.diagonal(dim1=2, dim2=3).fill_(True)
+        passes = (self.contact.unsqueeze(2) > reaches).any(-1)
         return sent, arrives, self._listen(known, entry, code, arrives, passes)
 
     def _fly(
@@ -185,7 +188,7 @@ class Exchange(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Returns the entries said and their codes, [k] each, and the bytes, int64 [envs, r]."""
         radios, items = self.shape[1:]
-        contact = _lately(self.heard, step.view(-1, 1, 1))
+        contact = _lately(self.heard, step.int().view(-1, 1, 1))
         met = (contact & ~self.contact).any(-1)
         other = (contact != self.contact).any(-1)
         self.pending[other] = _OPEN * self.pending[other].clamp(max=1)
@@ -284,8 +287,8 @@ class Exchange(nn.Module):
 
 
 def _lately(at: Tensor, step: Tensor) -> Tensor:
-    """Returns which steps, -1 for never, are among the last `CONTACT`."""
-    return (at >= 0) & (step - at < CONTACT)
+    """Returns which steps are among the last `CONTACT`."""
+    return at > step - CONTACT
 
 
 def share(
