@@ -38,6 +38,8 @@ OF_MAP = [
     *("learner.gamma=0.95", "learner.gae_lambda=0.95", "learner.epochs=1", "learner.lr=1e-3"),
     *("learner.minibatches=8", "num_envs=32", "episodes=40", "evaluation.interval=5"),
 ]
+OF_WORLD = {"swarm": ["num_envs=16"]}
+"""in other worlds `num_envs` is that of `OF_MAP`; a team of `swarm` has four times as many UAVs"""
 ATTENTION = "policy.message=attention"
 EXCHANGES: dict[str, tuple[str, Sequence[str]]] = {
     "none": ("independent", []),
@@ -48,11 +50,18 @@ EXCHANGES: dict[str, tuple[str, Sequence[str]]] = {
     "attention_16": ("independent", [ATTENTION, "policy.message_size=152"]),
     "maps_unlimited": ("maps", ["env.radio.range=.inf"]),
     "consensus": ("consensus", []),
+    "maps_from_none": ("maps", []),
+    "none_from_maps": ("independent", []),
 }
 """name -> method and settings: all in which arms with the same observation differ"""
+START = {"maps_from_none": "none", "none_from_maps": "maps"}
+"""exchange -> that of the arm whose imitation is its warm start, where this is another arm"""
 ARMS: dict[str, dict[str, Sequence[str]]] = {
     "front": {
-        "map": ("none", "maps", "attention", "maps_16", "attention_16", "maps_unlimited"),
+        "map": (
+            *("none", "maps", "attention", "maps_16", "attention_16", "maps_unlimited"),
+            *("maps_from_none", "none_from_maps"),
+        ),
         "vector": ("none", "attention", "consensus"),
     },
     "relay": {"map": ("none", "maps", "attention", "maps_unlimited")},
@@ -86,11 +95,12 @@ def commands(folder: Path, seed: int) -> Iterator[list[str]]:
     world, (observed, name) = folder.parent.name, folder.name.split("_", 1)
     common, more = settings(world, observed, name), [f"seed={seed}", *OF_SWEEP]
     if observed == "map":
-        first = folder.with_name(f"imitation_{name}") / f"s{seed}"
-        taught = [*OF_IMITATION, *TEACHER.get(world, [])]
-        yield ["sweep", *common, *taught, *more, f"output={first}"]
+        start = START.get(name, name)
+        first = folder.with_name(f"imitation_{start}") / f"s{seed}"
+        taught = [*settings(world, observed, start), *OF_IMITATION, *TEACHER.get(world, [])]
+        yield ["sweep", *taught, *more, f"output={first}"]
         more.append(f"learner.warm_start={_run(first)}")
-    trained = OF_VECTOR if observed == "vector" else OF_MAP
+    trained = OF_VECTOR if observed == "vector" else [*OF_MAP, *OF_WORLD.get(world, [])]
     yield ["sweep", *common, *trained, *more, f"output={folder / f's{seed}'}"]
     for fault in ("zero", "shuffle") if "message" in str(common) else ():
         run = _run(folder / f"s{seed}")

@@ -6,14 +6,14 @@ from workloads import flying, in_turns, jaxmarl_flying, make, strong, vmas_flyin
 
 @pytest.mark.parametrize("world", ["paper", "front"])
 @pytest.mark.parametrize("method", ["independent", "consensus", "maps"])
-def test_held_actions(tell, method, world):
-    """64 environments: a call of `step` for ten steps, beside ten calls."""
-    works = [flying(strong(method, 64, f"world={world}", hold=h), 20 // h) for h in (1, 10)]
-    single, held = (6 * 64 * 20 / taken for taken in in_turns(7, *works))
-    tell(
-        f"{method:11} in {world:5}: held {held:9,.0f} UAV-steps/s, {held / single:.2f} x steps one "
-        "by one"
-    )
+@pytest.mark.parametrize("team", ["env.num_uavs=6", "env.num_uavs=64 env.radio.range=.inf"])
+def test_held_actions(tell, method, world, team):
+    """384 UAVs: a call of `step` for ten steps, beside ten calls."""
+    keys, envs = [f"world={world}", *team.split()], 6 if "64" in team else 64
+    works = [flying(strong(method, envs, *keys, hold=h), 20 // h) for h in (1, 10)]
+    single, held = (384 * 20 / taken for taken in in_turns(7, *works))
+    rates = f"held {held:9,.0f} UAV-steps/s, {held / single:.2f} x steps one by one"
+    tell(f"{method:11} in {world:5}, {team}: {rates}")
 
 
 LIMITS = ("bandwidth=64", "shared=true", "delay=5", "loss=0.2", "burst=5", "fade=true")
