@@ -116,8 +116,10 @@ class Exchange(nn.Module):
     def start_episodes(self, mask: Tensor) -> None:
         """Forgets everything in the environments of a mask, bool [envs]."""
         blank = dict.fromkeys(("pending", "rank", "contact", "got", "acknowledged"), 0)
-        blank |= dict.fromkeys(("told_at", "said_at"), -1) | dict.fromkeys(("told", "has"), _NOTHING)
-        blank |= dict.fromkeys(("heard", "reached"), _NEVER)
+        blank |= dict.fromkeys(("told_at", "said_at"), -1)
+        blank |= dict.fromkeys(("told", "has"), _NOTHING) | dict.fromkeys(
+            ("heard", "reached"), _NEVER
+        )
         self.links.start_episodes(mask)
         for name, value in blank.items():
             getattr(self, name)[mask] = value
