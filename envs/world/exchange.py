@@ -117,9 +117,8 @@ class Exchange(nn.Module):
         """Forgets everything in the environments of a mask, bool [envs]."""
         blank = dict.fromkeys(("pending", "rank", "contact", "got", "acknowledged"), 0)
         blank |= dict.fromkeys(("told_at", "said_at"), -1)
-        blank |= dict.fromkeys(("told", "has"), _NOTHING) | dict.fromkeys(
-            ("heard", "reached"), _NEVER
-        )
+        blank |= dict.fromkeys(("told", "has"), _NOTHING)
+        blank |= dict.fromkeys(("heard", "reached"), _NEVER)
         self.links.start_episodes(mask)
         for name, value in blank.items():
             getattr(self, name)[mask] = value
