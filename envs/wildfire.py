@@ -144,10 +144,7 @@ class WildfireEnv(EnvBase):
         self._seeded = True
 
     def _reset(
-        self,
-        tensordict: TensorDictBase | None = None,
-        *,
-        position: Tensor | None = None,
+        self, tensordict: TensorDictBase | None = None, *, position: Tensor | None = None
     ) -> TensorDictBase:
         """Starts an episode in the environments that "_reset" names, else in all.
 

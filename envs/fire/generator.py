@@ -132,10 +132,7 @@ def fire_seeds(split: Split, count: int, test_seed: int = TEST_FROM) -> Tensor:
 
 
 def make_fires(
-    config: GeneratedConfig,
-    seeds: Tensor,
-    grid: tuple[int, int],
-    horizon: int,
+    config: GeneratedConfig, seeds: Tensor, grid: tuple[int, int], horizon: int
 ) -> Tensor:
     """Returns the times of one fire per seed. A fire depends on its seed alone.
 

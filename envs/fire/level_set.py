@@ -152,10 +152,7 @@ def _refined(field: Tensor, grid: tuple[int, int], x: Tensor, y: Tensor) -> Tens
 
 
 def _hamiltonian(
-    phi: Tensor,
-    wavelet: tuple[Tensor, Tensor, Tensor],
-    azimuth: Tensor,
-    drift: Tensor | None,
+    phi: Tensor, wavelet: tuple[Tensor, Tensor, Tensor], azimuth: Tensor, drift: Tensor | None
 ) -> Tensor:
     """Computes −φ_t at unit multiplier and node spacing, upwind of ∂H/∂∇φ plus the drift."""
     a, b, c = (r[:, None, None] for r in wavelet)

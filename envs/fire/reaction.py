@@ -236,11 +236,7 @@ def _burn(
 
 
 def _ring(
-    config: ReactionConfig,
-    draw: dict[str, Tensor],
-    grid: tuple[int, int],
-    refine: int,
-    border: int,
+    config: ReactionConfig, draw: dict[str, Tensor], grid: tuple[int, int], refine: int, border: int
 ) -> tuple[Tensor, Tensor]:
     """Returns temperature rise and fuel at step 0: a hot ring whose inside is burnt out."""
     x, y = (nodes(side, border, refine, draw["centre_x"].device) for side in grid)

@@ -47,7 +47,7 @@ class FileFireConfig:
     crs: _Text | None = None
     """Projection of a file that carries none, else the target projection."""
     layer: _Text | None = None
-    """Layer of a GeoPackage, or variable of a NetCDF, that has several."""
+    """Layer of a GeoPackage, variable of a NetCDF, or band of a GeoTIFF, that has several."""
     time_field: _Text | tuple[_Text, ...] | None = None
     """Column of the perimeters' times, or columns of the date, the time of day, or their parts."""
     time_format: Annotated[str, Field(pattern=_FORMAT, max_length=100)] | None = None
@@ -61,7 +61,7 @@ class FileFireConfig:
     radius: Annotated[float, Field(gt=0, le=1e5)] | None = None
     """Radius in metres of the circle that stands for a point, such as a detection of FIRMS."""
     unburned: float | tuple[float, ...] | Literal["none"] | None = None
-    """Values of a raster, or states of masks, that are not fire; `none` if all values are times."""
+    """Values of a raster, or states of masks, that are no fire; a list has all, `none` is empty."""
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
     """SHA-256 of the content of `path` and `test`; a run records it and checks it afterwards."""
     saved_copy: Annotated[str | None, Field(exclude=True)] = dataclasses.field(

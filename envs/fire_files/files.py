@@ -37,7 +37,7 @@ _HEADS = {
 """First bytes of each format."""
 TABLES = ("shp", "gpkg", "json", "kml", "kmz", "csv", "folder")
 """Formats of perimeters."""
-_GRID = "ForestGrid"  # begins the names of Cell2Fire's maps
+GRIDS = "ForestGrid"  # begins the names of Cell2Fire's maps
 _SUFFIXES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".kmz", ".csv")
 _BESIDE = ".shx .dbf .prj .cpg -wal -journal .aux.xml .msk .ovr .aux .tfw .tifw .tiffw .wld .tab"
 """Endings of the files that the libraries open beside one."""
@@ -72,7 +72,7 @@ def damage(expected: str) -> Iterator[None]:
 def find_format(path: Path) -> str:
     """Returns the format of a file or folder, and checks that it is safe to open."""
     if path.is_dir():
-        return "grids" if members(path)[0].name.startswith(_GRID) else "folder"
+        return "grids" if members(path)[0].name.startswith(GRIDS) else "folder"
     kind, size = _format(path), path.stat().st_size
     if kind in ("csv", "kml", "points", "json") and size > MAX_BYTES:
         raise ask(f"{size} bytes", f"a text file of at most {MAX_BYTES}")
@@ -95,8 +95,8 @@ def _format(path: Path) -> str:
     for kind, start in _HEADS.items():
         if head and re.match(start, head):
             return kind
-    known = "GeoTIFF, NetCDF, ESRI ASCII, .npy, .shp, .gpkg, GeoJSON, KML, KMZ, CSV of points"
-    raise ask(f"{path.name} begins with {head[:16]!r}", f"{known}, the paper's text")
+    known = "GeoTIFF, NetCDF, ESRI ASCII, .npy, .shp, .gpkg, GeoJSON, KML, KMZ, the paper's text"
+    raise ask(f"{path.name} begins with {head[:16]!r}", f"{known}, CSV of latitude,longitude,...")
 
 
 def _beside(path: Path) -> list[Path]:
@@ -108,9 +108,10 @@ def _beside(path: Path) -> list[Path]:
 def members(folder: Path) -> list[Path]:
     """Returns the maps of Cell2Fire in a folder, in the order of their numbers, or perimeters."""
     paths = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES]
-    paths = [path for path in paths if path.name.startswith(_GRID)] or paths
+    paths = [path for path in paths if path.name.startswith(GRIDS)] or paths
     if not 0 < len(paths) <= _MAX_FILES:
-        raise ask(f"a folder with {len(paths)} files of perimeters", f"1 to {_MAX_FILES}")
+        known = f"1 to {_MAX_FILES} of {', '.join(_SUFFIXES)}, or {GRIDS}*.csv"
+        raise ask(f"a folder with {len(paths)} files of fires", known)
     return sorted(paths, key=lambda path: (len(path.name), path.name))
 
 

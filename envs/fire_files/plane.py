@@ -10,6 +10,7 @@ from emberlink.envs.fire_files.report import ask
 
 Bounds = tuple[float, float, float, float]
 """Minimum x, minimum y, maximum x, maximum y."""
+DEGREES = "EPSG:4326"
 _BENT = 1.1  # ratio of a projection's axes above which a file is projected to another plane
 _MAX_DEGREES = 20.0  # across; a UTM zone is no plane for more
 _SAMPLES = 180  # points along the grid's shorter side; a cell gets the earliest of them
@@ -23,6 +24,7 @@ class Plane(NamedTuple):
     source: Any = None
     target: Any = None
     unit: float = 1.0  # metres on the ground of a unit of length on the plane, where it is known
+    west: float = -180.0  # the lowest longitude of the file's degrees
 
     def project(self, x: Any, y: Any, *, back: bool = False) -> tuple[Any, Any]:
         """Projects coordinates of the file onto the plane, or back."""
@@ -31,7 +33,10 @@ class Plane(NamedTuple):
         from pyproj import Transformer
 
         ends = (self.target, self.source) if back else (self.source, self.target)
-        return Transformer.from_crs(*ends, always_xy=True).transform(x, y)
+        x, y = Transformer.from_crs(*ends, always_xy=True).transform(x, y)
+        if back and self.source.is_geographic:  # longitudes as the file has them
+            x = (x - self.west) % 360 + self.west
+        return x, y
 
 
 class Window(NamedTuple):
@@ -97,13 +102,15 @@ def choose_plane(crs: Any, wanted: str | None, bounds: Bounds) -> Plane:
     shape, ratio, unit = _shape(source, source, bounds)
     if not (crs and wanted) and ratio <= _BENT:
         return Plane(f"projection {source.name} ({shape})", source, unit=unit)
-    zone: Any = GeoSeries([box(*bounds)], crs=source).estimate_utm_crs
+    middle = (bounds[0] + bounds[2]) / 2
+    turn = 360 * round(middle / 360) if source.is_geographic else 0  # for longitudes to 360
+    zone: Any = GeoSeries([box(*bounds)], crs=source).translate(-turn).estimate_utm_crs
     target = CRS.from_user_input(wanted) if crs and wanted else zone()
     after, bent, unit = _shape(target, source, bounds)
     if bent > _BENT:
         raise ask(f"fire.crs={wanted} has {after} here", "one as UTM is")
     about = f"projection {source.name} ({shape}), projected to {target.name} ({after})"
-    return Plane(about, source, target, unit)
+    return Plane(about, source, target, unit, middle - 180)
 
 
 def _shape(crs: Any, source: Any, bounds: Bounds) -> tuple[str, float, float]:

@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,12 @@ import numpy as np
 from scipy.ndimage import binary_erosion, map_coordinates, minimum_filter, minimum_filter1d
 
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.files import damage, members
-from emberlink.envs.fire_files.plane import Bounds, Plane, Window, choose_plane
+from emberlink.envs.fire_files.files import GRIDS, damage, members
+from emberlink.envs.fire_files.plane import DEGREES, Bounds, Plane, Window, choose_plane
 from emberlink.envs.fire_files.report import Clock, Report, ask
 from emberlink.envs.fire_files.times import decided_unit, in_order, in_utc, names_unit, parse_dates
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import as_argument
 
 _MAX_CELLS = 50_000_000
 MAX_BANK = 300_000_000
@@ -118,22 +120,24 @@ def read_raster(
     if kind == "points":
         return [_front_points(path, config, report)]
     if kind in ("npy", "grids"):
-        maps, affine, crs = _array(path, kind), np.eye(3), None
+        maps, affine, crs, in_degrees = _array(path, kind), np.eye(3), None, False
         if config.kind != "masks":
             return _bank(maps, config, horizon, report)
         times, clock, what = _of_states(maps, config)
     else:
         with damage("a whole raster"), _opened(path, kind, config.layer) as dataset:
             affine, crs = np.reshape(dataset.transform, (3, 3)), dataset.crs
-            if config.kind == "masks":
-                times, clock, what = _of_states(_read(dataset, MAX_BANK), config)
-            else:
-                times, clock, what = _band(dataset, kind == "nc", config, report)
+            in_degrees = "degrees_north" in dataset.tags().values()  # an axis of NetCDF
+            read = _maps_of_states if config.kind == "masks" else _band
+            times, clock, what = read(dataset, config, report)
     nowhere = Plane("no place in the file: square cells, the first row in the north")
     fire = as_fire(times, clock, nowhere)
     if crs is not None or not np.allclose(affine, np.eye(3)):
         fire.matrix = affine
-        fire.plane = choose_plane(crs, config.crs, fire.bounds(fire.last))
+        bounds = fire.bounds(fire.last)
+        if crs is None and in_degrees and max(map(abs, bounds)) <= 360:
+            crs = DEGREES
+        fire.plane = choose_plane(crs, config.crs, bounds)
     begin, end = clock.format(fire.first), clock.format(fire.last)
     burn = f"{np.isfinite(times).sum()} cells burn from {begin} to {end}"
     report.facts += [burn, what, fire.plane.about]
@@ -167,40 +171,86 @@ def _read(dataset: Any, most: int, band: int | None = None) -> np.ndarray:
     return dataset.read([band] if band else None)
 
 
-def _band(dataset: Any, last: bool, config: FileFireConfig, report: Report) -> _Times:
-    """Returns the times of a raster's only or `last` band, their clock, and the band in words."""
-    band = dataset.count if last else 1
-    if dataset.count != band:
-        raise ask(f"{dataset.count} bands", "one", "maps of states with fire.kind=masks")
-    tags = {name.lower(): text for name, text in (dataset.tags() | dataset.tags(band)).items()}
-    titles = dataset.descriptions[band - 1], tags.get("long_name"), tags.get("netcdf_varname")
+def _band(dataset: Any, config: FileFireConfig, report: Report) -> _Times:
+    """Returns the times of the band `fire.layer` or of a variable's last band, and their clock."""
+    tags = {name.lower(): text for name, text in dataset.tags().items() if "#" not in name}
+    tags |= {name.lower(): text for name, text in dataset.tags(dataset.count).items()}
+    variable, band = tags.get("netcdf_varname"), dataset.count
+    titles = [str(title or band) for band, title in enumerate(dataset.descriptions, 1)]
+    names = [variable] if variable else titles
+    if (layer := config.layer) and layer in names:
+        band = band if variable else names.index(layer) + 1
+    elif layer or len(names) > 1:
+        seen = f"the bands {', '.join(names[:30])}"
+        key = f"the one of arrival times, such as {as_argument('fire.layer', names[0])}"
+        raise ask(seen, key, "maps of states with fire.kind=masks")
     told = (text for name, text in tags.items() if names_unit(name))
-    declared = (dataset.units[band - 1] or next(told, "")).strip()
-    what = f"band {next((title for title in titles if title), band)!r:.60}"
-    what += f", the last of {band} times" if band > 1 else ""
+    declared = (dataset.units[band - 1] or next(told, "")).strip(" []")
+    what = f"band {tags.get('long_name', variable or titles[band - 1])!r:.60}"
+    what += f", the last of {band} times" if variable and band > 1 else ""
     what += f" ({declared})" if declared else ""
-    values = _read(dataset, _MAX_CELLS, band)[0] * dataset.scales[band - 1]
-    values, nodata = values + dataset.offsets[band - 1], dataset.read_masks(band) == 0
-    unit = decided_unit(declared, config, what, report)
-    since = declared.partition(" since ")[2].strip()
-    dated = re.search(r"\d", since)  # the time of ignition, for example, has no date
-    origin = in_utc(parse_dates([since], None, "units")[0]) if dated else None
+    values, nodata = _read(dataset, _MAX_CELLS, band)[0], dataset.read_masks(band) == 0
+    if config.units is None and not declared.strip("-1") and _are_states(values[~nodata]):
+        states = "fire.kind=masks if they are states", "fire.units=hours or such if they are times"
+        raise ask(f"{what} has no other values than states have", *states)
+    values = values * dataset.scales[band - 1] + dataset.offsets[band - 1]
+    unit, origin = _unit(declared, config, what, report)
     return *in_order(_arrival(values, config, nodata), unit, config, origin), what
 
 
-def _of_states(maps: np.ndarray, config: FileFireConfig) -> _Times:
+def _unit(
+    declared: str, config: FileFireConfig, what: str, report: Report
+) -> tuple[str, datetime | None]:
+    """Returns the unit of times, and the date of 0 if it is declared, as in `days since` it."""
+    unit, since = decided_unit(declared, config, what, report), declared.partition(" since ")[2]
+    if not re.search(r"\d", since):  # the time of ignition, for example, has no date
+        return unit, None
+    return unit, in_utc(parse_dates([since.strip()], config.time_format, "units")[0])
+
+
+def _are_states(values: np.ndarray) -> bool:
+    """Returns whether values are whole numbers of maps of states, and maybe NODATA."""
+    return bool(np.isin(values, (*range(6), *_NEVER)).all())
+
+
+def _maps_of_states(dataset: Any, config: FileFireConfig, report: Report) -> _Times:
+    """Returns the times of maps of states in bands, at the times of their axis in NetCDF."""
+    maps, nodata, at = _read(dataset, MAX_BANK), dataset.read_masks() == 0, np.arange(dataset.count)
+    unit, origin, tags = None, None, [dataset.tags(band) for band in dataset.indexes]
+    for axis in [name for name in tags[0] if name.startswith("NETCDF_DIM_")]:
+        places = np.array([float(tag[axis]) for tag in tags])
+        name = axis.removeprefix("NETCDF_DIM_")
+        declared = dataset.tags().get(f"{name}#units", "")
+        even = len(np.unique(np.diff(places).round(6))) < 2 and not declared
+        if len(np.unique(places)) == len(maps) > 1 and not even:
+            unit, origin = _unit(declared, config, f"the axis {name}", report)
+            order = np.argsort(places)
+            maps, nodata, at = maps[order], nodata[order], places[order]
+    first, clock, what = _of_states(maps, config, nodata)
+    if unit is None:
+        return first, clock, what
+    times = np.where(np.isfinite(first), at[np.nan_to_num(first, posinf=0).astype(int)], np.inf)
+    return *in_order(times, unit, config, origin), f"{what}, at the times of their axis"
+
+
+def _of_states(
+    maps: np.ndarray, config: FileFireConfig, nodata: np.ndarray | bool = False
+) -> _Times:
     """Returns the number of the first map in which each cell is not unburnt."""
-    states = np.unique(maps)
+    nodata = nodata | np.isnan(maps)
+    states = np.unique(maps[~nodata])
     listed = ", ".join(f"{state:g}" for state in states[:12])
-    burns = ~np.isin(maps, (0,) if config.never is None else config.never)
+    burns = ~nodata & ~np.isin(maps, (0,) if config.never is None else config.never)
     odd, share = not np.isin(states, (0, 1, 2)).all(), burns[0].mean()
     if config.never is None and (odd or share > 0.5):
-        some = "[0,3,4,5]' of SimFire's with its lines" if odd else "[0,1]' if 1 is a tree"
+        others = ",".join(f"{state:g}" for state in states if state not in (1, 2))
+        some = f"[{others}]' if 1 and 2 are fire" if odd else "[0,1]' if 1 is a tree"
         seen = f"states {listed}, not 0 in {share:.0%} of the first map"
         raise ask(seen, f"fire.unburned, those that are no fire, such as 'fire.unburned={some}")
     times = np.where(burns.any(0), burns.argmax(0), np.inf)
     unit = config.units if config.units not in (None, "steps") else "maps"
-    what = f"{len(maps)} maps of the states {listed}, rows from north to south"
+    size = " x ".join(map(str, maps.shape[:0:-1]))
+    what = f"{len(maps)} maps of {size} cells, states {listed}, rows from north to south"
     return *in_order(times, unit, config), what
 
 
@@ -221,19 +271,17 @@ def _array(path: Path, kind: str) -> np.ndarray:
 def _bank(fires: np.ndarray, config: FileFireConfig, horizon: int, report: Report) -> list[Raster]:
     """Returns fires in steps, [fires, X, Y], each a whole map."""
     count, columns, rows = fires.shape
-    full = (np.isfinite(fire).all() or np.mean(fire == 0) > 0.5 for fire in fires)
-    if config.never is None and any(full):
-        values, counts = np.unique(fires[np.isfinite(fires)], return_counts=True)
-        most = np.argsort(-counts, kind="stable")[:6]
-        listed = ", ".join(f"{values[k]:g} ({counts[k] / fires.size:.0%})" for k in sorted(most))
-        keys = [f"fire.unburned={values[most[0]]:.9g}", "fire.kind=masks", "fire.unburned=none"]
-        states = len(values) <= 6 and (values % 1 == 0).all()
-        seen = f"{count} maps of the states {listed}, some without inf, never, or burning at first"
-        raise ask(seen, *keys[int(states) :])
+    if config.never is None and _are_states(fires[~np.isnan(fires)]):
+        states, cells = np.unique(fires, return_counts=True)
+        shares = zip(states, cells / fires.size, strict=True)
+        seen = ", ".join(f"{state:g} ({share:.0%})" for state, share in shares)
+        seen = f"{count} maps of the states {seen}"
+        raise ask(seen, "fire.kind=masks", "fire.unburned=none if they are steps")
     if config.units not in (None, "steps") and config.test is None:  # no other file has units
         raise ask(f"fire.units={config.units}: a bank is in steps", "none")
     report.facts.append(f"a bank of {count} fires of {columns} x {rows} cells, in steps")
-    read = [as_fire(_arrival(values.T[::-1], config), Clock("steps")) for values in fires]
+    times = _arrival(fires.reshape(-1, rows), config, bank=True).reshape(fires.shape)
+    read = [as_fire(fire.T[::-1], Clock("steps")) for fire in times]
     last = max(fire.last for fire in read)
     if config.start is config.end is None and last > horizon:
         report.doubts.append(f"fires burn until step {last:g}: fire.end={last:g} stretches them")
@@ -252,45 +300,58 @@ def _front_points(path: Path, config: FileFireConfig, report: Report) -> Raster:
                 points = np.reshape(values, (-1, 3))[:, :2] - (_SIDE - 1) / 3
             x, y = np.trunc(points).clip(-2, _SIDE + 1).astype(int).T + 2
             np.minimum.at(times, (x, y), float(count - 1 - _SKIPPED))
+    if np.isinf(times).all():
+        seen = f"a text of {count} lines, without points after line {_SKIPPED} as the paper's has"
+        raise ask(seen, f"the folder of Cell2Fire's {GRIDS}*.csv", "a raster as ESRI ASCII or TIFF")
     report.facts.append(f"the paper's text of {count} lines, a line per time")
     times = minimum_filter(times, footprint=_CROSS)[2:-2, 2:-2]
     return as_fire(times.T[::-1], Clock(config.units or "steps"))
 
 
 def _arrival(
-    values: np.ndarray, config: FileFireConfig, nodata: np.ndarray | None = None
+    values: np.ndarray,
+    config: FileFireConfig,
+    nodata: np.ndarray | bool = False,
+    *,
+    bank: bool = False,
 ) -> np.ndarray:
-    """Returns arrival times, inf for never; asks about negative ones, and plateaus of a file."""
+    """Returns arrival times, inf for never; asks about negative ones and plateaus.
+
+    In a bank, less than half of the cells may burn at step 0, where an episode begins.
+    """
     times = np.array(values, np.result_type(values, np.float32))
     never = np.array([*_NEVER, *(config.never or ())], times.dtype)
-    void = ~(np.abs(times) <= _VOID) | np.isin(times, never)
-    times[void | (False if nodata is None else nodata)] = np.inf
+    times[~(np.abs(times) <= _VOID) | np.isin(times, never) | nodata] = np.inf
     told, counts = np.unique(times[np.isfinite(times)], return_counts=True)
     odd = told < 0
-    if config.never is None and nodata is not None:
-        odd |= _plateaus(times, told, counts)
+    if not isinstance(config.unburned, tuple | str):  # a list has all of them
+        begins = (told == 0) & bank & (2 * counts < times.size)
+        if config.unburned is None and (~odd).sum() > 1:
+            odd |= ~begins & (counts > counts[~odd].sum() / 2)
+        while (more := _apart(times, told, np.where(odd | begins, 0, counts))).any():
+            odd |= more
     if odd.any():
         asked = [f"{value:.9g}" for value in told[odd][:6]]
         shares = zip(asked, counts[odd] / counts.sum(), strict=False)
         listed = " and ".join(f"{value} ({share:.0%} of the cells)" for value, share in shares)
         others = f"{told[~odd].min():g} to {told[~odd].max():g}" if not odd.all() else "none"
         seen = f"{listed} may stand for cells that do not burn (others: {others})"
-        some = ",".join([*(f"{value:.9g}" for value in config.never or ()), *asked])
+        given = ",".join(f"{value:.9g}" for value in config.never or ())
+        some = ",".join([*filter(None, [given]), *asked])
         key = f"'fire.unburned=[{some}]'" if "," in some else f"fire.unburned={some}"
-        none = () if (told < 0).any() else ("fire.unburned=none if they burn then",)
-        raise ask(seen, key, *none)
+        other = f"'fire.unburned=[{given}]'" if given else "fire.unburned=none"
+        raise ask(seen, key, *[f"{other} if they burn then"] * (not (told < 0).any()))
     return times
 
 
-def _plateaus(times: np.ndarray, told: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Returns which values of 0 or more may stand for cells that do not burn.
+def _apart(times: np.ndarray, told: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Returns which values may stand for cells that do not burn, of those with a count above 0.
 
-    They hold more than half of the cells; or are the first or last value, and far from the rest or
-    frequent along the edge of the raster, where a fire has cells of many times.
+    They are the first or last value, and far from the rest or frequent along the edge of the
+    raster, where a fire has cells of many times.
     """
-    times, counts = np.where(times < 0, np.inf, times), np.where(told < 0, 0, counts)
-    held = np.flatnonzero(counts)
-    odd = (counts > counts.sum() / 2) & (len(held) > 1)
+    times = np.where(np.isin(times, told[counts == 0]), np.inf, times)
+    odd, held = np.zeros(len(told), np.bool_), np.flatnonzero(counts)
     if len(held) > 2:
         few = len(held) == 3  # of three values only, 0, 60 and 180 are times
         inner: Any = binary_erosion(np.isfinite(times))

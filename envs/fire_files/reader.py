@@ -21,7 +21,7 @@ from emberlink.envs.fire_files.report import Report
 from emberlink.envs.utils.atomic_io import write_bytes
 from emberlink.envs.utils.errors import UserError, naming, printable
 
-_OF_TABLES = ("time_field", "time_format", "incident", "incident_field", "where", "radius")
+_OF_TABLES = ("time_field", "incident", "incident_field", "where", "radius")
 
 
 def read_with_summary(

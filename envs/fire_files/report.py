@@ -27,7 +27,8 @@ class Clock:
     def format(self, time: float) -> str:
         """Returns a time as text."""
         if self.origin is None or abs(time * SECONDS[self.unit]) > 1e10:
-            return f"{time:g} {self.unit}".replace("day_of_year", "days")
+            text = f"{time:g}" if abs(time) < 1e4 else f"{time:.10g}"
+            return f"{text} {self.unit}".replace("day_of_year", "days")
         date = self.origin + timedelta(seconds=time * SECONDS[self.unit])
         return date.isoformat(timespec="minutes")
 
@@ -37,7 +38,7 @@ class Clock:
             return first
         if first > last - first > 0:
             seen = f"times from {self.format(first)} to {self.format(last)}"
-            raise ask(seen, "fire.start=0 if it began at 0", f"fire.start={first:g} if then")
+            raise ask(seen, "fire.start=0 if it began at 0", f"fire.start={first:.12g} if then")
         return 0.0
 
 

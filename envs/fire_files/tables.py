@@ -17,22 +17,24 @@ from geopandas import GeoDataFrame, points_from_xy
 
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.files import MAX_BYTES, damage, find_format, members
+from emberlink.envs.fire_files.plane import DEGREES
 from emberlink.envs.fire_files.report import ask
 from emberlink.envs.fire_files.times import FOLDERS, column_named, date_within, plain
 from emberlink.envs.utils.errors import UserError, unknown
 from emberlink.envs.utils.validation import as_argument
 
 _SHAPES = ("Point", "LineString", "Polygon", "MultiGeometry")
-_DEGREES = "EPSG:4326"
 _MAYBE_ID = r"name|nombre|nom|id|num|number|label|perim\w*id|(f|fire|ig|ignition|event)?(year|yr)"
 _FIRE = r"(incident|incid|inc|fire|event|burn|complex|cpx|cluster|merged?|case)s?"
 _ID = (
-    rf"(poly|attr)?{_FIRE}|.*{_FIRE}(unique)?(na|nam|name|nm|id|ident|identifier|num|number|no|nr|code|desig)"
-    r"|fname|feu|.*irwin.*|.*uniquefire.*"
+    rf"(poly|attr)?{_FIRE}|.*{_FIRE}(unique)?(n(ame?|am?|m)?|i(d\w*)?|nu(m\w*)?|no|nr|c(o(de?)?)?|desig|label)"
+    r"|fname|fihname|.*irwin.*|.*uniqu(ef\w*)?|localincid|agencyfir|numparte|codsgif"
+    r"|(id|num|cod|nom|nombre)?(incendi[oea]|feu|fogo|brand)(id|nr|name)?"
 )
 """Columns that identify a fire, by the letters of their names, or maybe features or times."""
 _MAYBE_KIND = (
-    r".*(class|kind|type|status|symbol)|(type|tipo|kind|prescri|delete|isrx).*|layer|folder"
+    r".*(class|kind|type|status|symbol|(fire|incident)typ?)|layer|folder"
+    r"|(type|tipo|kind|kategorie|treatment|delete|(is)?(prescri|planned|rx)).*"
 )
 _KIND = r".*categ.*|(poly)?featu\w*"
 """Columns of kinds of features, or maybe descriptions of each."""
@@ -76,7 +78,7 @@ def _csv(path: Path, _: str | None) -> Any:
     table = pandas.read_csv(path, dtype=str, skipinitialspace=True)
     at = {str(name).lower(): table[name] for name in table.columns}
     points = points_from_xy(at["longitude"], at["latitude"])
-    return GeoDataFrame(table, geometry=points, crs=_DEGREES)
+    return GeoDataFrame(table, geometry=points, crs=DEGREES)
 
 
 def _by_gdal(path: Path, wanted: str | None) -> Any:
@@ -91,9 +93,11 @@ def _by_gdal(path: Path, wanted: str | None) -> Any:
 
 def _geojson(path: Path, _: str | None) -> Any:
     """Reads GeoJSON; texts and numbers beside the features become columns, such as `valid_at`."""
-    whole = orjson.loads(path.read_bytes())
+    whole = orjson.loads(path.read_bytes().removeprefix(b"\xef\xbb\xbf"))
+    if whole.get("type") not in ("Feature", "FeatureCollection"):
+        raise ask(f"JSON of type {whole.get('type')!r}", "GeoJSON: a Feature or FeatureCollection")
     features = [whole] if whole.get("type") == "Feature" else whole["features"]
-    crs: Any = _DEGREES
+    crs: Any = DEGREES
     if given := whole.get("crs"):
         if given.get("type") != "name":
             raise ask("its crs is a link, which is not followed", "a name, or none")
@@ -102,10 +106,10 @@ def _geojson(path: Path, _: str | None) -> Any:
         if shape.get("type") == "Polygon":  # shapely reads arrays twice as fast
             shape["coordinates"] = [np.array(ring) for ring in shape["coordinates"]]
     frame: Any = GeoDataFrame.from_features(features, crs=crs)
-    if crs == _DEGREES and abs(frame.total_bounds).max() > 360:
+    if crs == DEGREES and abs(frame.total_bounds).max() > 360:
         frame = frame.set_crs(None, allow_override=True)  # not as GeoJSON is defined
     about = {**whole, **(whole.get("properties") or {}), **(whole.get("metadata") or {})}
-    taken = ("type", "name", *frame.columns)
+    taken = ("type", "name", "timeStamp", *frame.columns)  # the time of the download, in OGC API
     more = {k: v for k, v in about.items() if isinstance(v, str | int | float) and k not in taken}
     return frame.assign(**more)
 
@@ -116,6 +120,8 @@ def _kml(path: Path, _: str | None) -> Any:
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             parts = [part for part in archive.infolist() if part.filename.lower().endswith(".kml")]
+            if not parts:
+                raise ask("an archive without .kml", "a KMZ, or the files of others unpacked")
             if sum(part.file_size for part in parts) > MAX_BYTES:
                 raise ask("its .kml is too large", f"{MAX_BYTES} bytes at most")
             contents = [archive.read(part) for part in parts]
@@ -129,7 +135,7 @@ def _kml(path: Path, _: str | None) -> Any:
             ElementTree.SubElement(marks, "Placemark").extend(shapes)
     text = b"<kml>" + ElementTree.tostring(marks) + b"</kml>"
     shapes = pyogrio.read_dataframe(io.BytesIO(text), columns=[]).geometry
-    return GeoDataFrame(rows, geometry=shapes, crs=_DEGREES)
+    return GeoDataFrame(rows, geometry=shapes, crs=DEGREES)
 
 
 def _placemarks(
@@ -147,7 +153,8 @@ def _placemarks(
     row = {"Name": element.findtext("name"), "TimeStamp": time, "Folder": FOLDERS.join(folders)}
     row["Description"] = element.findtext("description")
     for part in (*element.iter("Data"), *element.iter("SimpleData")):
-        row.setdefault(str(part.get("name")), "".join(part.itertext()).strip())
+        if not row.get(name := str(part.get("name"))):
+            row[name] = (part.findtext("value") or "".join(part.itertext())).strip()
     for part in (element, *element.iter("MultiGeometry")):
         for ring in part.findall("LinearRing"):  # GDAL reads a ring only within a polygon
             ring.tag = "LineString"
@@ -202,6 +209,8 @@ def _of_incident(table: Any, config: FileFireConfig) -> Any:
         table = table[is_it[chosen := is_it.any().idxmax()]]
         other = f"{as_argument('fire.incident_field', chosen)} beside fire.incident for all these"
     if (several := _several(table, _ID, _MAYBE_ID)) and not (wanted and field):
+        # Two fires may have one name, or be of one year.
+        several.sort(key=lambda n: (-table[n].nunique(), not re.fullmatch(_ID, plain(n))))
         answer = as_argument("fire.incident", next(filter(None, table[several[0]])))
         seen = f"{len(table)} features of several fires: {_counts(table, several)}"
         raise ask(seen, f"{as_argument('fire.incident_field', several[0])} {answer}", other)

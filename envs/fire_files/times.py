@@ -4,7 +4,7 @@ import functools
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from datetime import UTC, datetime, time, timedelta
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,6 @@ _UNITS = {
     "steps": r"steps?|time ?steps?",
     "no unit of time": r"m|ft|feet|foot|met(er|re)s?|deg(ree)?s?|%|percent|.+/.+",
 }
-_MIDNIGHT = r"[T ](00:00(:00)?([.]0+)?|12:00(:00)? AM)(Z|[+]00(:?00)?)?$"
 _DAYS = ("%Y-%m-%d", "%Y-%j", "%d-%b-%Y", "%d-%b-%y", "%b-%d-%Y", "%Y%m%d")
 """Patterns of days; - is any separator."""
 _ORDERS = {
@@ -66,7 +65,7 @@ _DATE = re.compile(
     rf"|{_MONTH}[-\s]+\d\d?(?:st|nd|rd|th)?,?\s+\d{{4}})"
     r"(?:(?:T|,?[\s-]+(?:(?:at|@)\s*)?|(?<=\d{8})(?=\d{4}))(?P<hour>\d\d?|(?=[ap]\.?m\b))"
     r"(?=[:h]?\d\d|\s?[ap]\.?m)(?:[:h]?(?P<minute>\d\d))?(?::?(?P<second>\d\d)(?:[.,]\d+)?)?"
-    rf"(?:\s?(?P<half>[ap])\.?m\.?)?(?:\s?h(?:ou)?rs?\b)?(?:\s?\(?(?P<zone>{_ZONE})\b\)?)?"
+    rf"(?:\s?(?P<half>[ap])\.?m\.?)?(?:\s?(?:h(?:ou)?rs?|uhr)\b)?(?:\s?\(?(?P<zone>{_ZONE})\b\)?)?"
     r"(?:\s?(?P<sign>[+-])(?P<hours>[01]?\d)(?::?(?P<minutes>\d\d))?(?:\s?\([^)]*\))?)?)?(?!\d)",
     re.IGNORECASE,
 )
@@ -100,22 +99,28 @@ def read_times(
     if "%" not in (config.time_format or ""):  # of names and descriptions, only the date in them
         loose = table.columns.intersection([*_OUTSIDE, "Description"])
         table = table.assign(**{name: table[name].map(date_within) for name in loose})
-    names = _columns(table, config.time_field)
-    if len(empty := table.index[(table[names] == "").any(axis=1)]):
-        key = as_argument("fire.where", *config.conditions, names[0])
-        seen = f"{empty[0]} has no time in {names[0]} ({len(empty)} of {len(table)})"
-        raise ask(seen, "one in each", f"{key} to leave out those without")
+    names, form = _columns(table, config.time_field), config.time_format
+    _refuse_empty(table, names, config)
     texts = table[names[0]]
-    if len(names) == 1 and config.time_format is None and not all(map(is_date, texts.unique())):
+    if len(names) == 1 and form is None and not all(map(is_date, texts.unique())):
         numbers = texts.str.extract(r"^(\d+(?:\.\d*)?(?:e[-+]?\d+)?)$", expand=False).astype(float)
         if numbers.notna().all():
             return _elapsed(numbers.to_numpy(), names[0], table, config, report)
-    if config.time_field is None and not _has_clock(
-        parse_dates(texts, config.time_format, names[0], table.index)
-    ):
-        names += _clocks_beside(table, names[0])
+    if config.time_field is None:
+        dates = parse_dates(texts, form, names[0], table.index)
+        names += [] if _has_clock(dates) else _clocks_beside(table, names[0])
+        if all(date.tzinfo is None for date in dates) and (_has_clock(dates) or names[1:]):
+            zones = [name for name in table if re.fullmatch("(time)?zone|tz", plain(name))]
+            names += [name for name in zones if all(table[name])]
+        _refuse_empty(table, names, config)
     title = " and ".join(map(str, names))
-    dates = parse_dates(_joined(table, names), config.time_format, title, table.index)
+    if len(names) > 1 and "%" not in (form or ""):
+        with suppress(UserError):  # such as a year, without its month
+            dates = parse_dates(texts, form, title)
+            if not _has_clock(dates):  # midnight, also of another zone
+                days = [f"{date:%Y-%m-%d}" for date in dates]
+                table, form = table.assign(**{names[0]: days}), None
+    dates = parse_dates(_joined(table, names), form, title, table.index)
     naive = {date.tzinfo is None for date in dates}
     if len(naive) > 1:
         raise ask(f"{title}: some times have a zone and others have none", "one in all")
@@ -124,8 +129,9 @@ def read_times(
     moments = [in_utc(date) for date in dates]
     first, last = min(moments), max(moments)
     values = np.array([(moment - first) / timedelta(minutes=1) for moment in moments])
-    if last > datetime.now(UTC) + timedelta(days=1):
-        report.doubts.append(f"{last:%Y-%m-%d} is in the future")
+    report.doubts += [f"{first:%Y-%m-%d} is long ago"] * (first.year < 1950)
+    future = last > datetime.now(UTC) + timedelta(days=1)
+    report.doubts += [f"{last:%Y-%m-%d} is in the future"] * future
     days = np.unique(values) if not _has_clock(dates) else ()
     if within := sum(_nested(shapes[values == day]) for day in days):
         report.doubts.append(
@@ -135,13 +141,25 @@ def read_times(
     return values, Clock("minutes", first)
 
 
+def _refuse_empty(table: Any, names: Sequence[Any], config: FileFireConfig) -> None:
+    for name in names:
+        if len(empty := table.index[table[name] == ""]):
+            if len(empty) == len(table):
+                raise ask(f"no date is found in {name}", "its pattern in fire.time_format")
+            key = as_argument("fire.where", *config.conditions, name)
+            seen = f"{empty[0]} has no time in {name} ({len(empty)} of {len(table)})"
+            raise ask(seen, "one in each", f"{key} to leave out those without")
+
+
 def _elapsed(
     values: np.ndarray, name: str, table: Any, config: FileFireConfig, report: Report
 ) -> tuple[np.ndarray, Clock]:
-    about = f"{name} ({values.min():g} to {values.max():g})"
-    told = {u for u in SECONDS if re.fullmatch(rf"elapsed{u[:2]}\w*|{u}", plain(name))}
+    about = f"{name} ({values.min():.10g} to {values.max():.10g})"
+    form = r"elapsed{0:.2}\w*|(arrival)?(time|toa|t)(in)?{0:.3}\w*|{0}"
+    told = {u for u in SECONDS if re.fullmatch(form.format(u), plain(name))}
     told = told or {text for column in table if names_unit(column) for text in table[column]}
-    unit = decided_unit(told.pop() if len(told) == 1 else "", config, about, report)
+    dates = "the pattern of dates in fire.time_format"
+    unit = decided_unit(told.pop() if len(told) == 1 else "", config, about, report, dates)
     report.facts.append(f"times from {name}")
     return in_order(values, unit, config)
 
@@ -157,13 +175,18 @@ def _columns(table: Any, given: str | Sequence[str] | None) -> list[Any]:
     found = [name for name in known if name in dated] or known
     found = found or [name for name in filled if name in _OUTSIDE and all(table[name])]
     if not found or table[found].ne(table[found[0]], axis=0).any(axis=None):
-        maybe = found or [*dated, *(name for name in filled if name not in dated)][:15]
+        maybe = found or [*dated, *(name for name in filled if name not in dated)]
+        maybe = sorted(maybe, key=lambda name: table[name].nunique() == 1)[:15]
         seen = ", ".join(f"{name} ({table[name].iloc[0][:30]})" for name in maybe)
-        fields = maybe[:1] or ["COLUMN"]
-        if fields[0] in dated and ":" not in table[fields[0]].iloc[0]:
+        parts = [n for part in ("year", "month", "day") for n in filled if plain(n) == part]
+        fields = parts if len(parts) == 3 else maybe[:1] or ["COLUMN"]
+        if fields == parts or (fields[0] in dated and ":" not in table[fields[0]].iloc[0]):
             fields += _clocks(table.drop(columns=fields))
         key = as_argument("fire.time_field", *fields)
-        raise ask(f"which column holds the times: {seen or 'none'}?", f"{key} or such")
+        undated = [name for name in _OUTSIDE if name in table and name not in filled]
+        keys = [f"fire.time_field={name} with its pattern in fire.time_format" for name in undated]
+        keys.insert(len(keys) * (fields[0] not in dated), f"{key} or such")
+        raise ask(f"which column holds the times: {seen or 'none'}?", *keys)
     return found[:1]
 
 
@@ -181,7 +204,7 @@ def _clocks(table: Any) -> list[Any]:
     """Returns the columns that may hold times of day, by their names or by all of their values."""
     names = []
     for name in table:
-        values = table[name][table[name] != ""]
+        values = table[name][[text != "" and not is_date(text) for text in table[name]]]
         named = re.fullmatch(_OF_DAY, plain(name)) and values.str.match(r"\d{1,6}(?i:z|h|\b)").any()
         all_are = len(values) > 0 and values.str.match(r"(?i)\d\d?[:h]\d\d|[ap]\.?m\b").all()
         names += [name] if named or all_are else []
@@ -191,7 +214,6 @@ def _clocks(table: Any) -> list[Any]:
 def _joined(table: Any, names: Sequence[Any]) -> Any:
     """Joins dates with times of day in columns of hours, minutes, HHMM, HH:MM, and AM or PM."""
     joined = table[names[0]]
-    joined = joined.str.replace(_MIDNIGHT, "", regex=True) if len(names) > 1 else joined
     for name in names[1:]:
         part, title = table[name], plain(name)
         if re.fullmatch(_MINUTE, title):
@@ -213,7 +235,9 @@ def _nested(shapes: Any) -> bool:
     return bool((sizes[inner] < 0.9 * sizes[outer]).any())
 
 
-def decided_unit(declared: str, config: FileFireConfig, what: str, report: Report) -> str:
+def decided_unit(
+    declared: str, config: FileFireConfig, what: str, report: Report, *others: str
+) -> str:
     """Returns the unit of the file or of the key; asks if there is none or they differ."""
     form = r"({})[.]?( *[(].*| (since|after|from) .*)?"
     units = (u for u in _UNITS if re.fullmatch(form.format(_UNITS[u]), declared, re.IGNORECASE))
@@ -224,7 +248,7 @@ def decided_unit(declared: str, config: FileFireConfig, what: str, report: Repor
         report.doubts.append(f"{what} is in {declared[:20]!r}, read as {unit}")
     if unit is None:
         some = "fire.units=minutes (FARSITE, FlamMap), seconds (ELMFIRE, WRF-SFIRE) or such"
-        raise ask(f"the unit of {what} is not known", some)
+        raise ask(f"the unit of {what} is not known", some, *others)
     if known not in (None, unit) and {known, unit} != {"days", "day_of_year"}:
         raise ask(f"{what} is in {known}", f"fire.units={known}, not {unit}")
     return unit
@@ -271,8 +295,9 @@ def _fits(texts: Sequence[str], form: str | None) -> dict[str, list[datetime]]:
     """Reads texts by the pattern `form`, or by each that may fit them all, by their digits."""
     wholes = (re.sub(r"[.]\d+$", "", text) for text in texts)
     lengths = {len(whole) if whole.isdecimal() else 0 for whole in wholes}
-    fits = {}
-    for name in (form,) if form else _DIGITS.get(max(lengths), ()) if len(lengths) == 1 else ():
+    fits, whole = {}, {8, 12, 14}  # digits of a day, with or without a time of day
+    length = lengths.pop() if len(lengths) == 1 else 0 if lengths <= whole else -1
+    for name in (form,) if form else _DIGITS.get(length, ()):
         with suppress(ValueError, OverflowError, OSError):
             fits[name] = [_read(text, name) for text in texts]
     return fits
@@ -296,8 +321,8 @@ def date_within(text: str) -> str:
 
 
 def _has_clock(dates: Sequence[datetime]) -> bool:
-    """Returns whether one of some dates has a time of day other than midnight."""
-    return any(date.time() != time() for date in dates)
+    """Returns whether dates have times of day: not all the same, such as midnight."""
+    return len({date.time() for date in dates}) > 1
 
 
 def in_utc(date: datetime) -> datetime:
@@ -312,7 +337,7 @@ def _read(text: str, form: str) -> datetime:
     if form in _SINCE_1970:
         return datetime.fromtimestamp(float(text) / _SINCE_1970[form], UTC)
     if "%" in form:
-        return datetime.strptime(text, form)
+        return datetime.strptime(text, form.replace("%H", "%I") if "%p" in form else form)
     if not (match := _DATE.fullmatch(text)):
         raise ValueError(text)
     part = {name: found or "" for name, found in match.groupdict().items()}

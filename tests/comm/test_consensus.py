@@ -7,10 +7,7 @@ import torch
 from tensordict import TensorDict
 from time_steps import WORLD, communication, time_step
 
-from emberlink.comm.consensus import (
-    ConsensusConfig,
-    HeadingConfig,
-)
+from emberlink.comm.consensus import ConsensusConfig, HeadingConfig
 from emberlink.envs import keys
 from emberlink.envs.config import RadioConfig, WildfireConfig
 from emberlink.envs.world import radio

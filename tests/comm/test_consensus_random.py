@@ -36,10 +36,7 @@ def test_random_networks_equal_plain_python(uavs):
     talk: Communication | None = None
     scalars = [
         ScalarConsensus(
-            radio.range,
-            any_fire=any_fire,
-            agree=config.agree,
-            nearest=config.follow == "nearest",
+            radio.range, any_fire=any_fire, agree=config.agree, nearest=config.follow == "nearest"
         )
         for _ in range(envs)
     ]

@@ -6,11 +6,7 @@ import pytest
 import torch
 from time_steps import WORLD, communication, time_step
 
-from emberlink.comm.consensus import (
-    ConsensusConfig,
-    HeadingConfig,
-    circling,
-)
+from emberlink.comm.consensus import ConsensusConfig, HeadingConfig, circling
 from emberlink.envs import keys
 from emberlink.envs.config import RadioConfig, RewardConfig, WildfireConfig
 

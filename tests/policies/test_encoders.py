@@ -8,9 +8,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from emberlink.envs import keys
 from emberlink.policies.networks.actor_critic import StackedActor, make_actor
-from emberlink.policies.networks.encoders import (
-    PictureEncoder,
-)
+from emberlink.policies.networks.encoders import PictureEncoder
 
 UAVS, ACTIONS, WINDOW, HIDDEN = 3, 3, 5, (10, 8)
 

@@ -276,8 +276,7 @@ def full_disk_trial(folder: Path, draw: random.Random) -> list[str]:
     (size,) = (path.stat().st_size for path in undisturbed.rglob(NEWEST))
     room = draw.randint(size // 2, size - 300)
     limited = command(
-        *(0, output, EPISODES),
-        lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (room, room)),
+        *(0, output, EPISODES), lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
     )
     child = Child(limited, folder)
     status, text = child.end(), child.text()

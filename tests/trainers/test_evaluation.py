@@ -101,6 +101,22 @@ def test_no_rule_of_a_method_changes_the_flight_of_a_scripted_policy(cache):
     assert measured[0] == measured[1]
 
 
+def scripted_in(world, name, *keys):
+    more = ["env.horizon=60", "fire.num_train_fires=2", "env.radio.bandwidth=20"]
+    config = resolve("consensus", [f"world={world}", "setup=strong", *more, *keys])
+    arrival = evaluate.evaluation_fires(config, 2)["front"]
+    return evaluate.play_scripted(config, name, arrival, block=2)
+
+
+def test_scripted_policies_send_reports_and_no_learned_messages(cache):
+    assert min(scripted_in("relay", "stationary")["bytes_per_step"]) > 0, "of reports alone"
+    silent = scripted_in("front", "follow_target")
+    for file in cache.glob("scripted-*"):
+        file.unlink()
+    says = ("policy.message=mean", "policy.message_size=16")
+    assert scripted_in("front", "follow_target", *says) == silent
+
+
 def test_eval_json_describes_the_evaluation(run, cache):
     assert main.main(["eval", str(run), "--fires", "3"]) == 0
     content = json.loads((run / "eval.json").read_text())

@@ -186,11 +186,7 @@ def test_the_id_and_the_mode_of_the_caller_are_respected(monkeypatch):
     run = command("wandb")
     names = {r.run.display_name for r in written(run) if r.HasField("run")}
     assert names == {"mine"}
-    monkeypatch.delenv("WANDB_RUN_ID")
-    time.sleep(1)  # wandb names the folder of a part by its second
-    trainers.resume(run.path, episodes=5)  # the id of the first part
     assert {file.name for file in run.path.rglob("*.wandb")} == {"run-run-of-mine.wandb"}
-    assert [row["_step"] for row in rows_of(run)] == [1, 2, 3, 4, 5]
     monkeypatch.setenv("WANDB_MODE", "disabled")
     Path("runs").rename("before")
     assert not [*command("wandb").path.rglob("*.wandb")]

@@ -64,7 +64,8 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
             after = td.get("next")
             if isinstance(policy, Scripted) and after.get(keys.BYTES_SENT, None) is not None:
                 sent = policy.bytes_sent(after)  # its messages, not the method's
-                after.update({} if sent is None else {keys.BYTES_SENT: sent})
+                if sent is not None:
+                    after.set(keys.BYTES_SENT, sent + after.get(keys.REPORT_BYTES, 0))
             if watch is not None:
                 watch(env, after, policy)
             steps.append(metrics.measured_steps(after.unsqueeze(1)))
@@ -210,10 +211,11 @@ def source_digest() -> str:
 def scripted_config(config: RunConfig, name: str) -> RunConfig:
     """Returns the configuration of the environment of a scripted policy.
 
-    It is the run's, with two exceptions. A policy that needs the communication of another
+    It is the run's, with three exceptions. A policy that needs the communication of another
     method has its settings in the run's setup. Where the run's communication would replace actions
-    of the policy, there is none.
+    of the policy, there is none. Nobody says the messages that the run's policy has learned.
     """
+    config = replace(config, policy=replace(config.policy, message="none"))
     recipe = SCRIPTED.find(name).recipe
     if recipe is None:
         steers = MODULES.find(config.comm["name"]).steer is not CommModule.steer

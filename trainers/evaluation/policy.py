@@ -112,10 +112,7 @@ class TrainedPolicy(TensorDictSequential):
         return primer_of(self)
 
     def replay(
-        self,
-        *others: "TrainedPolicy",
-        fire: str | int | None = None,
-        policies: Sequence[str] = (),
+        self, *others: "TrainedPolicy", fire: str | int | None = None, policies: Sequence[str] = ()
     ) -> Replay:
         """Returns a page that plays an episode of the evaluation; Jupyter shows it inline.
 

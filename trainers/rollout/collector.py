@@ -24,12 +24,7 @@ class ResumableCollector:
     """
 
     def __init__(
-        self,
-        env: TransformedEnv,
-        policy: TensorDictModuleBase,
-        *,
-        decisions: int,
-        rollout: int,
+        self, env: TransformedEnv, policy: TensorDictModuleBase, *, decisions: int, rollout: int
     ):
         self.decisions, self.rollout, self.made = decisions, rollout, 0
         primer: Any = primer_of(policy)

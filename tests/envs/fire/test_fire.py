@@ -91,11 +91,7 @@ def central_cells(grid: tuple[int, int], fires: int) -> torch.Tensor:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("grid", "fires", "tolerance"),
-    [
-        ((60, 60), 30, 0.02),
-        ((45, 30), 30, 0.02),
-        ((15, 15), 30, 0.04),
-    ],
+    [((60, 60), 30, 0.02), ((45, 30), 30, 0.02), ((15, 15), 30, 0.04)],
 )
 def test_a_scenario_scales_with_the_shorter_side(grid, fires: int, tolerance: float):
     """Checks that areas scale with the square of min(X, Y)/30 at the start and at the end."""

@@ -10,12 +10,7 @@ import torch
 from exact_front import exact_arrival
 from torch import Tensor
 
-from emberlink.envs.fire.generator import (
-    FireConfig,
-    fire_seeds,
-    load_scenario,
-    make_fires,
-)
+from emberlink.envs.fire.generator import FireConfig, fire_seeds, load_scenario, make_fires
 from emberlink.envs.fire.level_set import arrival_times, disc, ellipse_rates
 
 GRID, HORIZON = (30, 30), 1000

@@ -8,7 +8,7 @@ import pandas
 import pytest
 import rasterio
 import torch
-from fire_files import CORNER, UTM, Ellipses, answered, raster_of, squares, write_asc, write_tif
+from fire_files import CORNER, UTM, Ellipses, answered, raster_of, squares, write_tif
 from scipy.io import netcdf_file
 
 from emberlink.envs.fire_files.config import FileFireConfig
@@ -128,19 +128,6 @@ def test_a_raster_in_a_projection_that_bends(tmp_path):
     asks(plain, "has axes 3.* : 1", units="minutes", crs="+proj=sinu +lon_0=0")
 
 
-@pytest.mark.parametrize("value", [9999.0, 65535.0, 1e10, 305.0, 0.0])
-def test_a_plateau_is_asked_about(tmp_path, value):
-    times = raster_of(FIRE, 300.0)
-    burnt = np.where(times < 0, value, times + 1)
-    path = write_tif(tmp_path / "fire.tif", burnt, nodata=None)
-    question = rf"{re.escape(f'{value:g}')} \(\d+ ?% of the cells\).*fire.unburned="
-    asks(path, question, units="minutes")
-    plain = write_asc(tmp_path / "fire.asc", times + 1)
-    right = read(plain, units="minutes", unburned=-9998.0)[0]
-    assert torch.equal(read(path, units="minutes", unburned=value)[0], right)
-    assert read(path, units="minutes", unburned="none", end=301.0)[1]
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -249,7 +236,7 @@ def test_a_folder_of_cell2fire(tmp_path):
         np.savetxt(tmp_path / f"ForestGrid{step}.csv", grid, "%d", ",")
     asks(tmp_path, "11 maps of the states 0 .*fire.kind=masks")
     fire, about = read(tmp_path, kind="masks", margin=None)
-    assert "from 0 maps to 10 maps; 11 maps of the states 0, 1" in about
+    assert "from 0 maps to 10 maps; 11 maps of 12 x 10 cells, states 0, 1" in about
     assert (fire == 0).any(0).nonzero().flatten().tolist() == [8, 9]  # the sixth row from above
 
 

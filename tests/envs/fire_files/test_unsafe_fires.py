@@ -108,7 +108,7 @@ def test_no_regular_files_and_no_addresses(tmp_path, wholes):
     for name, match in {
         "pipe.tif": "not a regular file",
         "none.gpkg": "No such file",
-        "empty": "a folder with 0 files of perimeters",
+        "empty": "a folder with 0 files of fires",
         "large.geojson": "150000001 bytes; .* at most 150000000",
     }.items():
         refused(tmp_path / name, match)

@@ -20,6 +20,7 @@ from emberlink.trainers.comparison.bootstrap import crossed_interval, crossed_p,
 from emberlink.trainers.comparison.comparison import compare_runs
 
 LOSS, LOST = {"loss": 0.5}, "consensus, evaluated with env.radio.loss=0.5"
+START = "learner.warm_start"
 
 
 def only(comparison, measure="coverage"):
@@ -108,9 +109,6 @@ def test_measures_where_lower_is_better(tmp_path):
     assert (claim["ratio"], claim["verdict"]) == (pytest.approx(31 / 11), "holds")
 
 
-# Sections, labels
-
-
 def test_setups_fires_and_evaluations_have_separate_sections(tmp_path):
     write_run(tmp_path, "consensus", 0)
     write_run(tmp_path, "consensus", 1, overrides=("learner.batch_size=64",))
@@ -177,17 +175,14 @@ def test_seeds_with_a_warm_start_each_are_one_row(tmp_path):
     assert sorted(of_section.values()) == [[0, 1, 2], [3], [4, 5]]
 
 
-START = "learner.warm_start"
-
-
 def test_a_seed_is_counted_once(tmp_path):
     for name, coverage in (("2026-01-01", 1), ("2026-01-02", 2), ("pretrained_consensus_s0", 9)):
         write_run(tmp_path, "consensus", 0, name=name, learned={"coverage": coverage})
     write_run(tmp_path, "consensus", 1, learned={"coverage": 3})
     comparison = compare_runs([tmp_path])
     assert only(comparison)["values"].iloc[0] == [2, 3]
-    left_out = {path.rpartition("/")[2]: why for path, why in comparison.left_out}
-    assert left_out.keys() == {"2026-01-01", "pretrained_consensus_s0"}
+    left_out = {path.rpartition("/")[2] for path, _ in comparison.left_out}
+    assert left_out == {"2026-01-01", "pretrained_consensus_s0"}
 
 
 def test_other_evaluations_are_not_counted_as_runs(comparison, runs, tmp_path):
@@ -208,9 +203,6 @@ def test_other_evaluations_are_not_counted_as_runs(comparison, runs, tmp_path):
         run.name,  # the same settings twice
         "eval_step_7.json",
     }
-
-
-# Scripted policies, rewards
 
 
 def test_scripted_policies_have_rows_of_their_own(tmp_path):
@@ -236,9 +228,6 @@ def test_different_rewards_are_not_ranked(tmp_path):
     assert set(only(comparison)["not_ranked"]) == {""}
 
 
-# The difference of two labels
-
-
 def test_difference_by_hand(comparison):
     value, ends, p = comparison.difference("consensus", "independent", "coverage")
     first = np.array([[45.0, 55, 45, 55], [65, 75, 65, 75], [55, 65, 55, 65]])
@@ -252,9 +241,6 @@ def test_difference_by_hand(comparison):
     for wrong in (("consensu", "coverage"), ("positional", "mean_reward"), (LOST, "coverage")):
         with pytest.raises(UserError, match=r"is not known|rewards differ|same runs"):
             comparison.difference("consensus", *wrong)
-
-
-# The paper's claims
 
 
 def test_verdicts(tmp_path):
@@ -283,9 +269,6 @@ def test_claims_compare_runs_that_were_trained_alike(tmp_path):
     found = comparison.claims[comparison.claims["measure"] == "coverage"]
     assert sorted(found["ratio"]) == pytest.approx([0.5, 1.2, 1.2])
     assert any("no claims" in note and "batch_size=8" in note for note in comparison.notes)
-
-
-# The report
 
 
 class Page(html.parser.HTMLParser):
@@ -348,8 +331,7 @@ def test_names_from_files_are_escaped(tmp_path, capsys):
     results["huygens"][HOSTILE] = results["huygens"]["random_actions"]
     results[HOSTILE] = results["huygens"]
     write_evaluation(run, content)
-    arguments = ["compare", str(run), "--output", str(tmp_path / "out")]
-    assert main.main(arguments) == 0
+    assert main.main(["compare", str(run), "--output", str(tmp_path / "out")]) == 0
     page = Page(tmp_path / "out")
     assert "script" not in page.tags
     assert HOSTILE in page.text
@@ -370,9 +352,6 @@ def test_nothing_is_overwritten(tmp_path_factory, tmp_path, monkeypatch, capsys)
         assert capsys.readouterr().out.rstrip().splitlines()[-1] == f"{name}/compare.html"
     assert {file.name for file in tmp_path.iterdir()} == {"compare", "compare_2", "taken", "link"}
     assert [file.name for file in (tmp_path / "taken").iterdir()] == ["mine"]
-
-
-# Runs that cannot be compared
 
 
 SPOILT = {

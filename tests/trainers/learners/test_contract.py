@@ -33,7 +33,7 @@ CASES = {
         *("learner.share_parameters=true", "env.failures=1"),
     ],
     "td3": [
-        *("learner=td3", "policy.agent_index=true", "policy.hold=2", "learner.batch_size=8", *MAP),
+        *("learner=td3", "policy.agent_index=true", "policy.hold=2", "learner.batch_size=8", *MAP)
     ],
     "td3-team": [
         *("learner=td3", "learner.critic=team", "learner.batch_size=8"),

@@ -237,11 +237,7 @@ def test_a_stopped_sweep_saves_and_the_same_command_completes_it(tmp_path):
 @pytest.mark.heavy
 def test_a_killed_sweep_ends_its_trainings(tmp_path):
     (tmp_path / "random.py").write_text("raise RuntimeError('modules here are not imported')\n")
-    command = [
-        sys.executable,
-        *["-P", "-m", "emberlink", "sweep", "independent"],
-        *TRAINED,
-    ]
+    command = [sys.executable, *["-P", "-m", "emberlink", "sweep", "independent"], *TRAINED]
     process = subprocess.Popen([*command, "episodes=9999", "output=runs"], cwd=tmp_path)
     deadline = time.monotonic() + 300
     while not any(run.metrics() for run in folders_in(tmp_path / "runs")):

@@ -134,5 +134,5 @@ def test_evaluations_and_checkpoints_follow_their_intervals(tmp_path, monkeypatc
     assert best.best == max(coverage.values())
     assert best.step == 20 * max(coverage, key=lambda episode: coverage[episode])
     assert {path.name for path in run.path.iterdir()} == {
-        *("config.yaml", "metrics.jsonl", "checkpoint.safetensors", BEST, "lock"),
+        *("config.yaml", "metrics.jsonl", "checkpoint.safetensors", BEST, "lock")
     }

@@ -171,9 +171,7 @@ def test_what_a_killed_process_left_is_removed(whole, tmp_path):
     again = resume(run.path)
     assert (again.setup.step, len(run.metrics())) == (28, 2)
     left = {path.name for path in run.path.iterdir()}
-    assert left == {
-        *("config.yaml", METRICS, NEWEST, BEST, "lock", "thesis.part"),
-    }
+    assert left == {*("config.yaml", METRICS, NEWEST, BEST, "lock", "thesis.part")}
     assert_same(whole("positional", *REPLAY), until(again, None))
 
 
