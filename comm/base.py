@@ -210,15 +210,17 @@ class Communication(Transform):
         module, mask = self.module, tensordict.get("_reset", None)
         everywhere = torch.ones_like(tensordict_reset.get(keys.STEP), dtype=torch.bool)
         mask = everywhere if mask is None else mask.flatten()
-        before = {name: buffer.clone() for name, buffer in module.state_dict().items()}
+        some = not mask.all()
+        before = {n: buffer.clone() for n, buffer in module.state_dict().items()} if some else {}
         module.reset(tensordict_reset, mask)
         if module.maps is not None:
             module.maps.known.start_episodes(mask)
         result = self._heard(tensordict_reset)
         # The other environments are within an episode; their state must not change.
-        for name, buffer in module.state_dict().items():
-            began = mask.view(-1, *[1] * (buffer.ndim - 1))
-            buffer.copy_(torch.where(began, buffer, before[name]))
+        state = module.state_dict()
+        for name, old in before.items():
+            began = mask.view(-1, *[1] * (old.ndim - 1))
+            state[name].copy_(torch.where(began, state[name], old))
         return result
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -196,7 +196,8 @@ class Exchange(nn.Module):
         self.pending[met] = _OPEN * (known.last_seen[met] >= 0).char()
         self.contact.copy_(contact)
         active = contact.any(-1).view(-1).nonzero().squeeze(-1)
-        entry = _marked(self.pending.flatten(0, 1)[active] == _OPEN, active)
+        pending = self.pending.flatten(0, 1).index_select(0, active)
+        entry = _marked(pending, active, _OPEN)
         row = entry // items
         mine, theirs = codes(known, entry), self.has.view(-1, radios)[entry]
         now = step.int()[row // radios]
@@ -255,7 +256,7 @@ class Exchange(nn.Module):
         # Where the smallest entry fits, at most all the larger ones are passed over.
         most = int(left.max()) // self.smallest + self.larger
         left = left.view(-1, 1)[row]
-        rank, item = self.rank.flatten(0, 1)[row].topk(min(most, items))
+        rank, item = self.rank.flatten(0, 1).index_select(0, row).topk(min(most, items))
         size = self.sizes[item]
         size *= (rank > 0) & (size <= left)
         says = (size > 0) & (size.cumsum(-1) <= left)
@@ -346,11 +347,13 @@ def merged(one: Tensor, other: Tensor) -> Tensor:
     return torch.maximum(one, other) | (one | other) & 1
 
 
-def _marked(flags: Tensor, row: Tensor) -> Tensor:
-    """Returns the flat indices, sorted, of set flags [rows, items], which are rows of a table."""
-    maps, items = flags.flatten(), flags.shape[1]
+def _marked(flags: Tensor, row: Tensor, bit: int = 1) -> Tensor:
+    """Returns the flat indices, sorted, of flags with a bit [rows, items], of rows of a table."""
+    items = flags.shape[1]
     # Eight flags are read at a time, as most of them are not set.
+    maps = flags.flatten().view(torch.int8)
     eights = nn.functional.pad(maps, (0, -len(maps) % 8)).view(-1, 8)
-    some = eights.view(torch.int64).squeeze(-1).nonzero().squeeze(-1)
-    at = (8 * some.unsqueeze(-1) + torch.arange(8, device=maps.device))[eights[some]]
+    some = (eights.view(torch.int64) & 0x0101010101010101 * bit).squeeze(-1).nonzero().squeeze(-1)
+    flag = (eights[some] & bit).bool()
+    at = (8 * some.unsqueeze(-1) + torch.arange(8, device=maps.device))[flag]
     return row.take(at // items) * items + at % items
