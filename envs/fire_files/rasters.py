@@ -173,10 +173,8 @@ def _read(dataset: Any, most: int, band: int | None = None) -> np.ndarray:
 
 def _band(dataset: Any, config: FileFireConfig, report: Report) -> _Times:
     """Returns the times of the band `fire.layer` or of a variable's last band, and their clock."""
-    tags = {name.lower(): text for name, text in dataset.tags().items() if "#" not in name}
-    tags |= {name.lower(): text for name, text in dataset.tags(dataset.count).items()}
-    variable, band = tags.get("netcdf_varname"), dataset.count
-    titles = [str(title or band) for band, title in enumerate(dataset.descriptions, 1)]
+    variable, band = dataset.tags(1).get("NETCDF_VARNAME"), dataset.count
+    titles = [str(title or number) for number, title in enumerate(dataset.descriptions, 1)]
     names = [variable] if variable else titles
     if (layer := config.layer) and layer in names:
         band = band if variable else names.index(layer) + 1
@@ -184,6 +182,8 @@ def _band(dataset: Any, config: FileFireConfig, report: Report) -> _Times:
         seen = f"the bands {', '.join(names[:30])}"
         key = f"the one of arrival times, such as {as_argument('fire.layer', names[0])}"
         raise ask(seen, key, "maps of states with fire.kind=masks")
+    tags = dataset.tags() | dataset.tags(band)  # with a #, it is of another variable
+    tags = {name.lower(): text for name, text in tags.items() if "#" not in name}
     told = (text for name, text in tags.items() if names_unit(name))
     declared = (dataset.units[band - 1] or next(told, "")).strip(" []")
     what = f"band {tags.get('long_name', variable or titles[band - 1])!r:.60}"
