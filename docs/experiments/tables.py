@@ -148,10 +148,13 @@ def figures() -> dict[str, Figure]:
     known = yaml.safe_load(TEXTS.read_text())
     panels = [name for measures, _ in drawing.FIGURES.values() for name in measures]
     methods = ["consensus", "independent", "positional", "shared_memory"]
-    of_maps = [run for run in known["study_front"]["rows"].values() if run.startswith("map")]
+    arms = [run for run in known["study_front"]["rows"].values() if "@" not in run]
+    of_maps, of_vectors = ([a for a in arms if a.startswith(kind)] for kind in ("map", "vector"))
     return {
         "gains": gains(**known["gains"]),
         "learning": curves("study_front", of_maps, ["front/coverage"]),
+        "learning_vector": curves("study_front", of_vectors, ["front/coverage"]),
+        "learning_paper": curves("study_paper", of_vectors, ["huygens/coverage"]),
         "learning_relay": curves(
             "study_relay", of_maps, ["front/base_coverage_auc", "front/coverage"]
         ),
@@ -180,14 +183,16 @@ def gains(columns: dict[str, str], rows: dict[str, str], **_: str) -> Figure:
 def curves(study: str, labels: Sequence[str], measures: Sequence[str]) -> Figure:
     """Returns the learning curves of the runs that there are."""
     rows, every = [], frame(f"{study}.curves")
-    for key in product(labels, measures):
-        if key in every:
-            points = every[key].pivot(index="seed", columns="fire", values="value")
-            about = {"label": key[0], "measure": key[1].rpartition("/")[2]}
+    known = yaml.safe_load(TEXTS.read_text())[study]["rows"]
+    titles = {run: title.replace("`", "") for title, run in known.items() if run in labels}
+    for (run, title), measure in product(titles.items(), measures):
+        if (run, measure) in every:
+            points = every[run, measure].pivot(index="seed", columns="fire", values="value")
+            about = {"label": title, "measure": measure.rpartition("/")[2]}
             rows.append(rankings.band(points.to_numpy(), points.columns, **about))
     none = pd.DataFrame(columns=["label", "measure", "iqm"])
     shown = [measure.rpartition("/")[2] for measure in measures]
-    figure = drawing.training(pd.concat(rows), none, shown, labels)
+    figure = drawing.training(pd.concat(rows), none, shown, [*titles.values()])
     figure.set_size_inches(3 + 2.6 * len(measures), 3.4)
     return figure
 

@@ -161,6 +161,15 @@ def test_gradients_cross_uavs_as_finite_differences_say(scheme, memory, shared, 
             torch.testing.assert_close(gradient.reshape(-1)[index], slope, rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_permutation_of_the_uavs_permutes_the_actions(scheme):
+    net, observed, hears = network(scheme, "gru"), drawn(ENVS, 4, UAVS, FEATURES), links(4)
+    order = torch.randperm(UAVS, generator=torch.Generator().manual_seed(1))
+    mean, _ = net(net.empty_state(ENVS), observed, hears)
+    moved, _ = net(net.empty_state(ENVS), observed[:, :, order], hears[:, :, order][..., order])
+    torch.testing.assert_close(moved, mean[:, :, order])
+
+
 @pytest.mark.parametrize("scheme", ["none", *SCHEMES])
 @pytest.mark.parametrize("memory", ["none", "gru"])
 @pytest.mark.parametrize("lag", [0, 3])
