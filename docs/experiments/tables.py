@@ -167,13 +167,14 @@ def gains(columns: dict[str, str], rows: dict[str, str], **_: str) -> Figure:
     """Returns the last column of a table as dots with their intervals."""
     expressions = {name: [*columns.values()][-1].replace("{}", row) for name, row in rows.items()}
     found = {name: value for name, text in expressions.items() if (value := computed(text))}
-    figure = Figure(figsize=(8, 0.8 + 0.4 * len(found)), layout="constrained")
+    figure = Figure(figsize=(6, 0.8 + 0.3 * len(found)), layout="constrained")
     axes = figure.subplots()
     for y, (value, ends) in enumerate(found.values()):
         axes.plot(ends or [value] * 2, [y, y], "|-", lw=2, ms=9, mew=1.5, color=drawing.COLOURS[0])
         axes.plot([value], [y], "o", ms=7, color=drawing.COLOURS[0])
     axes.set_yticks(range(len(found)), [re.sub("`", "", x).replace(" | ", ", ") for x in found])
-    axes.set(xlabel=f"gain of teams trained with messages, {[*columns][-1].split(', ')[1]}")
+    unit = [*columns][-1].split(", ")[1]
+    figure.supxlabel(f"gain of teams trained with messages, {unit}", fontsize="medium")
     axes.axvline(0, color="0.3", lw=1.3)
     axes.invert_yaxis()
     axes.grid(alpha=0.3, axis="x")
