@@ -133,7 +133,7 @@ class Crops(nn.Module):
             kind += _widened(known & 3 == 1, self.spread)
         fields = self._fields.index_select(0, kind.flatten()).view_as(kind)
         # The sums overflow; their differences, which fit into the fields, are exact all the same.
-        return torch.nn.functional.pad(fields.cumsum(2).cumsum(1), (1, 0, 1, 0))
+        return torch.nn.functional.pad(fields, (1, 0, 1, 0)).cumsum_(2).cumsum_(1)
 
     def _sums(self, table: Tensor, centre: Tensor, edges: Tensor, scale: int) -> list[Tensor]:
         """Returns the channels that are sums over pixels, int64 [rows, S, S] each."""
@@ -172,7 +172,8 @@ class Crops(nn.Module):
 
 def _rounded(total: Tensor, count: Tensor | int) -> Tensor:
     """Returns total / count, rounded half up; float32 is exact enough for sums of a pixel."""
-    return (total / count).add_(0.5).to(torch.uint8)
+    # By way of 16 bits, which takes a quarter of the time on a CPU.
+    return (total / count).add_(0.5).to(torch.int16).to(torch.uint8)
 
 
 def _widened(mask: Tensor, reach: int) -> Tensor:
