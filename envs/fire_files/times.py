@@ -4,7 +4,7 @@ import functools
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime, time, timedelta
 from typing import Any
 
 import numpy as np
@@ -132,10 +132,11 @@ def read_times(
     report.doubts += [f"{first:%Y-%m-%d} is long ago"] * (first.year < 1950)
     future = last > datetime.now(UTC) + timedelta(days=1)
     report.doubts += [f"{last:%Y-%m-%d} is in the future"] * future
-    days = np.unique(values) if not _has_clock(dates) else ()
+    bare = np.array([date.time() == time() for date in dates]) | (not _has_clock(dates))
+    days = np.unique(values[bare])
     if within := sum(_nested(shapes[values == day]) for day in days):
         report.doubts.append(
-            f"{len(table)} features have {len(days)} dates in {title} without a time of day, and "
+            f"{bare.sum()} features have {len(days)} dates in {title} without a time of day, and "
             f"perimeters of one date lie in one another ({within} dates): their order is lost"
         )
     return values, Clock("minutes", first)

@@ -168,6 +168,9 @@ def test_orders_and_the_future(tmp_path, elapsed):
     squares(200, 300, 400, date=dates(3, 2090)).to_file(tmp_path / "fire.geojson")
     with pytest.warns(UserWarning, match="2090-09-05 is in the future"):
         same(tmp_path / "fire.geojson", elapsed)
+    squares(200, 300, 400, date=[*DAY[:2], "2020-09-06T09:30"]).to_file(tmp_path / "mixed.gpkg")
+    with pytest.warns(UserWarning, match="2 features have 1 dates .* order is lost"):
+        read(tmp_path / "mixed.gpkg")
 
 
 def test_a_unit_in_the_file_is_used_and_contradicts(tmp_path):

@@ -1,6 +1,5 @@
 """Second cases: one file of each kind of misreading gives its question, and the answer its grid."""
 
-import functools
 import re
 
 import numpy as np
@@ -113,7 +112,7 @@ FILES = {
     **{f"8 {u}": raster(TIMES, nodata=-9999.0, tags={"TIME_UNITS": u}) for u in UNITS},
     "8 column": table(t=[0, 60, 120], units=["min"] * 3),
     "9 states in bands": states,
-    "9 trees": functools.partial(states, unburnt=1),
+    "9 trees": lambda folder: states(folder, 1),
     "9 NODATA": raster(np.where(TIMES[::2, ::2] < 0, 99, LATE).astype("u1"), nodata=99),
     "9 times": netcdf(LATE, {"time": [0, 1, 4, 5]} | DEGREES, time="hours since 2020-09-05"),
     "10 bands": raster(np.stack([LATE[0], TIMES[::2, ::2]]).astype("f4"), nodata=-9999.0),

@@ -199,10 +199,8 @@ def test_other_evaluations_are_not_counted_as_runs(comparison, runs, tmp_path):
     found = compare_runs([run])
     named = "consensus, evaluated with evaluation.message_fault=zero"
     assert sorted(found.runs["label"]) == ["consensus", LOST, named]
-    assert {path.rpartition("/")[2] for path, _ in found.left_out} == {
-        run.name,  # the same settings twice
-        "eval_step_7.json",
-    }
+    left_out = {path.rpartition("/")[2] for path, _ in found.left_out}
+    assert left_out == {run.name, "eval_step_7.json"}, "the first has the same settings twice"
 
 
 def test_scripted_policies_have_rows_of_their_own(tmp_path):
