@@ -198,6 +198,11 @@ def _clocks_beside(table: Any, date: Any) -> list[Any]:
         key = f"{as_argument('fire.time_field', date, *names)} to join them"
         seen = f"{date} has no times of day, maybe {', '.join(names)} has"
         raise ask(seen, key, as_argument("fire.time_field", date))
+    for name in table.columns.drop([date, *names]):  # a full stamp named as a time of day
+        more = table[name].nunique() > table[date].nunique()
+        if more and re.fullmatch(_OF_DAY, plain(name)) and all(map(is_date, table[name])):
+            fields = (as_argument("fire.time_field", column) for column in (name, date))
+            raise ask(f"{date} has no times of day, and {name} holds dates, too", *fields)
     return names
 
 

@@ -20,7 +20,7 @@ LATE = np.stack([BURNS & (time >= TIMES) for time in (30, 60, 200, 300)])[:, ::2
 METRES = {"y": 30 * np.arange(100), "x": 30 * np.arange(100)}
 DEGREES = {"lat": 60 + 0.01 * np.arange(50), "lon": 243 + 0.01 * np.arange(50)}
 SINUSOIDAL = {"crs": "+proj=sinu +R=6371007.181", "transform": from_origin(0, 5.56e6, 1e4, 1e4)}
-PLATEAUS = (9999, 65535, 1e10, 305, 0)
+PLATEAUS, MINUTES = (9999, 65535, 1e10, 305, 0), {"units": "minutes"}
 UNITS = ("min.", "Minutes (elapsed)", "minutes since ignition")
 STATUS = ("status", "PrescribedFire", "Tipo", "Layer", "DeleteThis", "Folder")
 
@@ -90,6 +90,7 @@ FILES = {
     "1 parts": table(**PARTS),
     "1 at noon": table(DATE_=[f"{DAYS[k]}T12:00:00Z" for k in (0, 0, 1)], TIME_=HOURS),
     "1 a gap": table(DATE_=DAYS, TIME_=[*HOURS[:2], ""]),
+    "1 stamps": table(acq_date=DAYS[:1] * 3, acq_time=[f"2020-08-20 1{k}:30" for k in range(3)]),
     "1 zone": table(date=DAYS, time=HOURS, tz=["MDT"] * 3),
     "2 namesakes": table(date=DAYS, FireName=["Elk", "Elk", "Fox"], IRWINID=["{A}", "{B}", "{C}"]),
     "2 one each": table(date=DAYS, name=["Alder", "Birch", "Cedar"]),
@@ -128,16 +129,14 @@ CASES = {
     "1 parts": ({"time_field": [*PARTS]}, "", "from 2020-09-05T09:00.*T11:00"),
     "1 at noon": ({}, "", "3 times, from 2020-08-20T09:42.* to 2020-08-21T08:00"),
     "1 a gap": ({}, r"no time in TIME_ \(1 of 3\).*fire.where=TIME_", "from DATE_ and TIME_"),
+    "1 stamps": ({}, "fire.time_field=acq_time, or", "3 times, from 2020-08-20T10:30"),
     "1 zone": ({}, "", "from 2020-08-20T15:42"),
     "2 namesakes": ({}, r"Elk \(2\), Fox \(1\); expected fire.incident_field=IRWINID", ""),
     "2 one each": ({}, r"name: Alder \(1\), .*fire.incident=Alder", ""),
     "2 words": ({}, r"Fire Name: True \(2\)", "2 of 3 features used"),
     **{f"3 {name}": ({}, rf"{name}: No \(2\), Yes \(1\)", "2 of 3 features") for name in STATUS},
     "4 in a corner": ({"units": "days"}, "", "axes 1.15.* projected to"),
-    **{
-        f"5 {v:g}": ({"units": "minutes"}, rf"{re.escape(f'{v:g}')} \(\d", "723 cells")
-        for v in PLATEAUS
-    },
+    **{f"5 {v:g}": (MINUTES, rf"{re.escape(f'{v:g}')} \(\d", "723 cells") for v in PLATEAUS},
     "5 fills": ({"units": "day_of_year"}, r"-2 \(5 ?% .* and 0 .*\[-2,0\]", "200 days to 204"),
     "5 lit": ({"units": "minutes"}, "", "from 0 minutes to 149"),
     "5 three values": ({"units": "hours"}, "9999 ", "600 cells"),
