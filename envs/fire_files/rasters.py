@@ -215,28 +215,28 @@ def _are_states(values: np.ndarray) -> bool:
 
 def _maps_of_states(dataset: Any, config: FileFireConfig, report: Report) -> _Times:
     """Returns the times of maps of states in bands, at the times of their axis in NetCDF."""
-    maps, nodata, at = _read(dataset, MAX_BANK), dataset.read_masks() == 0, np.arange(dataset.count)
-    unit, origin, tags = None, None, [dataset.tags(band) for band in dataset.indexes]
+    maps, nodata, at, clock = _read(dataset, MAX_BANK), dataset.read_masks() == 0, None, None
+    tags = [dataset.tags(band) for band in dataset.indexes]
     for axis in [name for name in tags[0] if name.startswith("NETCDF_DIM_")]:
         places = np.array([float(tag[axis]) for tag in tags])
         name = axis.removeprefix("NETCDF_DIM_")
         declared = dataset.tags().get(f"{name}#units", "")
         even = len(np.unique(np.diff(places).round(6))) < 2 and not declared
         if len(np.unique(places)) == len(maps) > 1 and not even:
-            unit, origin = _unit(declared, config, f"the axis {name}", report)
+            clock = _unit(declared, config, f"the axis {name}", report)
             order = np.argsort(places)
             maps, nodata, at = maps[order], nodata[order], places[order]
-    first, clock, what = _of_states(maps, config, nodata)
-    if unit is None:
-        return first, clock, what
-    times = np.where(np.isfinite(first), at[np.nan_to_num(first, posinf=0).astype(int)], np.inf)
-    return *in_order(times, unit, config, origin), f"{what}, at the times of their axis"
+    return _of_states(maps, config, nodata, at, clock)
 
 
 def _of_states(
-    maps: np.ndarray, config: FileFireConfig, nodata: np.ndarray | bool = False
+    maps: np.ndarray,
+    config: FileFireConfig,
+    nodata: np.ndarray | bool = False,
+    at: np.ndarray | None = None,
+    clock: tuple[str, datetime | None] | None = None,
 ) -> _Times:
-    """Returns the number of the first map in which each cell is not unburnt."""
+    """Returns the time, or number, of the first map in which each cell is not unburnt."""
     nodata = nodata | np.isnan(maps)
     states = np.unique(maps[~nodata])
     listed = ", ".join(f"{state:g}" for state in states[:12])
@@ -247,11 +247,14 @@ def _of_states(
         some = f"[{others}]' if 1 and 2 are fire" if odd else "[0,1]' if 1 is a tree"
         seen = f"states {listed}, not 0 in {share:.0%} of the first map"
         raise ask(seen, f"fire.unburned, those that are no fire, such as 'fire.unburned={some}")
-    times = np.where(burns.any(0), burns.argmax(0), np.inf)
+    first = burns.argmax(0)
+    times = np.where(burns.any(0), first if at is None else at[first], np.inf)
     unit = config.units if config.units not in (None, "steps") else "maps"
     size = " x ".join(map(str, maps.shape[:0:-1]))
     what = f"{len(maps)} maps of {size} cells, states {listed}, rows from north to south"
-    return *in_order(times, unit, config), what
+    what += ", at the times of their axis" if clock else ""
+    unit, origin = clock or (unit, None)
+    return *in_order(times, unit, config, origin), what
 
 
 def _array(path: Path, kind: str) -> np.ndarray:

@@ -210,9 +210,11 @@ def _clocks(table: Any) -> list[Any]:
     """Returns the columns that may hold times of day, by their names or by all of their values."""
     names = []
     for name in table:
-        values = table[name][[text != "" and not is_date(text) for text in table[name]]]
+        values = table[name][table[name] != ""]
+        if len(values) == 0 or is_date(values.iloc[0]):
+            continue
         named = re.fullmatch(_OF_DAY, plain(name)) and values.str.match(r"\d{1,6}(?i:z|h|\b)").any()
-        all_are = len(values) > 0 and values.str.match(r"(?i)\d\d?[:h]\d\d|[ap]\.?m\b").all()
+        all_are = values.str.match(r"(?i)\d\d?[:h]\d\d|[ap]\.?m\b").all()
         names += [name] if named or all_are else []
     return names
 
